@@ -5,6 +5,7 @@ import sys
 
 from scanprep.interrupts import leave_at_once
 
+# name -> line of help, function; modules are imported when their command is called
 COMMANDS = {
     "demo": ("The whole chain on synthetic scans; ends with a page to open.", "completion.demo.cli:demo"),
     "prep": ("Scans -> registered meshes and a skeleton; also its single stages.", "scanprep.cli:group"),
@@ -29,7 +30,7 @@ COMMANDS = {
 
 
 def main(argv: list[str] | None = None) -> int:
-    """The command line."""
+    """Run the command line; return the exit code."""
     if argv is None:
         argv = sys.argv[1:]
         leave_at_once()

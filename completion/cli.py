@@ -17,7 +17,7 @@ Out = Annotated[Path, Alias("-o"), Called("--output")]
 
 
 def read_model(path: Path | None) -> tuple[BodyModel, str]:
-    """Read the model of a file, or without one that of the built-in people; with the name that reports give it."""
+    """Read a model from a file, by default that of the built-in people; also return its name for reports."""
     from model.files import BUILT_IN, load_model
 
     if path is None:
@@ -26,32 +26,32 @@ def read_model(path: Path | None) -> tuple[BodyModel, str]:
 
 
 def body_of(model: BodyModel, subject: str | None, unit: Unit | None) -> BodyModel | Subject:
-    """The model where the person's shape is to be found, else a body of known shape, as commands have --subject."""
+    """Return the model where the person's shape is to be found, else a body of known shape (--subject)."""
     if subject is None and model.n_betas:
         return model
-    from model.posing.cli import read_subject  # with all that makes models
+    from model.posing.cli import read_subject  # imported here, as it loads the learning code
 
     return read_subject(model, None if subject in (None, "template") else Path(str(subject)), unit)
 
 
-def marks_of_template(model: BodyModel, given: Path | None, name: str, wanted: bool = True) -> dict[str, int]:
-    """Vertices of a model's template by name, from a file or the model itself; `name` is the model's.
+def marks_of_template(model: BodyModel, file: Path | None, name: str, wanted: bool = True) -> dict[str, int]:
+    """Return vertices of a model's template by name, from a file or the model itself.
 
-    ValueError where there are none and they are wanted.
+    `name` is the model's, for messages. ValueError where there are no landmarks and they are wanted.
     """
     from scanprep.geometry.landmarks import read_landmark_vertices
 
-    if given is not None:
-        return read_landmark_vertices(given, model.template)
-    kept = model.info.get("landmarks") or {}
-    if wanted and not kept:
+    if file is not None:
+        return read_landmark_vertices(file, model.template)
+    stored = model.info.get("landmarks") or {}
+    if wanted and not stored:
         raise ValueError(f"{name}: the model keeps no landmarks of its template; name them with --template-landmarks")
-    return {name: int(vertex) for name, vertex in kept.items()}
+    return {name: int(vertex) for name, vertex in stored.items()}
 
 
 def read_landmark_pairs(model: BodyModel, name: str, scan: Path, template: Path | None, unit: Unit | None
                         ) -> tuple[np.ndarray, np.ndarray] | None:
-    """Vertices (L,) and points (L, 3) of the landmarks that a file and the model have in common; None where too few."""
+    """Return vertices (L,) and points (L, 3) of landmarks that file and model share; None where too few."""
     from scanprep.geometry.landmarks import read_landmarks, try_match_landmarks
 
     return try_match_landmarks(scan, marks_of_template(model, template, name), read_landmarks(scan, None, unit))

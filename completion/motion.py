@@ -1,4 +1,4 @@
-"""A motion: one pose and place a frame, and the file it lives in."""
+"""A motion: one pose and place per frame, and its file."""
 from __future__ import annotations
 
 from collections.abc import Callable
@@ -19,22 +19,39 @@ Progress = Callable[[int, int], None]            # called with (done, total)
 class Motion:
     """Poses of one body over time.
 
-    Attributes
+    Parameters
     ----------
     poses : (T, J, 3) float, radians
+        Axis-angle of every part relative to its parent.
     trans : (T, 3) float, metres
-    betas : (K,) float, or None for the template's own body
+        Place of the root.
+    betas : (K,) float, standard deviations, or None
+        Shape coefficients; None for the template's own body.
     rate : float, frames per second
+        Frame rate.
     residuals : (T, L) float, metres
         Distance of each marker from where the body puts it, NaN where it was not seen; L may be 0.
-    labels : L strings
-        The markers.
+    labels : tuple of str
+        Names of the L markers.
     gender : str
         As body-model files name it: "male", "female" or "neutral".
     converged : (T,) bool
-        Frames whose solution settled; all true for a motion that was read from a file.
+        Frames whose solution converged; all of them for a motion read from a file.
     trusted : (T, L) bool
-        Markers that were seen and believed under their own label; when not given, all that were seen.
+        Markers that were seen and used under their own label; by default all that were seen.
+
+    Raises
+    ------
+    ValueError
+        Arrays whose shapes do not match.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from completion import Motion
+    >>> still = Motion(np.zeros((60, 16, 3)), np.zeros((60, 3)), None, 30.0, np.zeros((60, 0)))
+    >>> still, round(float(still.times[-1]), 2)
+    (Motion(60 frames at 30/s, 16 parts), 1.97)
     """
 
     poses: np.ndarray
@@ -54,6 +71,7 @@ class Motion:
                              f"and {self.trans.shape}")
         if self.residuals.shape != (T, len(self.labels)):
             raise ValueError(f"residuals: expected shape {(T, len(self.labels))}, got {self.residuals.shape}")
+        # defaults that depend on the other arrays
         if not len(self.converged):
             object.__setattr__(self, "converged", np.ones(T, dtype=bool))
         if not self.trusted.size:
@@ -66,26 +84,52 @@ class Motion:
 
     @property
     def times(self) -> np.ndarray:
-        """(T,) seconds from the first frame."""
+        """(T,) float, seconds from the first frame."""
         return np.arange(len(self.poses)) / self.rate
 
     @property
     def distrusted(self) -> tuple[str, ...]:
-        """Markers that were seen, but believed in less than a tenth of those frames."""
+        """Markers that were seen, but trusted in less than a tenth of these frames."""
         seen = np.isfinite(self.residuals)
-        few = (self.trusted & seen).sum(axis=0) < 0.1 * seen.sum(axis=0)
-        return tuple(label for label, is_few in zip(self.labels, few, strict=True) if is_few)
+        rarely_trusted = (self.trusted & seen).sum(axis=0) < 0.1 * seen.sum(axis=0)
+        return tuple(label for label, rare in zip(self.labels, rarely_trusted, strict=True) if rare)
 
     def residuals_of_trusted(self) -> np.ndarray:
-        """The residuals (T, L) of the markers that tell of the body, metres, NaN for those that are `distrusted`."""
+        """Return the residuals of the markers that are not `distrusted`.
+
+        Returns
+        -------
+        (T, L) float, metres
+            NaN for distrusted markers.
+        """
         return np.where(np.isin(self.labels, self.distrusted), np.nan, self.residuals)
 
     def vertices(self, subject: Subject, frames: np.ndarray | slice = slice(None)) -> np.ndarray:
-        """The meshes (n, N, 3) of some frames, metres."""
+        """Compute the meshes of some frames.
+
+        Parameters
+        ----------
+        subject : Subject
+            The body that moves.
+        frames : (n,) int or slice
+            Which frames; by default all.
+
+        Returns
+        -------
+        (n, N, 3) float, metres
+        """
         return subject.vertices(self.poses[frames], self.trans[frames])
 
     def save(self, path: str | Path, **more: np.ndarray) -> None:
-        """Write an `.npz` with the array names that body-model files use, poses as (T, 3J), and more arrays."""
+        """Write an `.npz` with the array names of body-model files, poses as (T, 3J).
+
+        Parameters
+        ----------
+        path : str or Path
+            File to write.
+        **more : np.ndarray
+            Further arrays for the file.
+        """
         arrays = {
             "poses": self.poses.reshape(len(self.poses), -1), "trans": self.trans,
             "betas": np.zeros(0) if self.betas is None else self.betas,
@@ -96,19 +140,44 @@ class Motion:
         storage.save_arrays(path, arrays)
 
     @staticmethod
-    def of(found: BodyMotion) -> Motion:
-        """A motion that came from no markers."""
-        none = np.zeros((len(found.poses), 0))
-        return Motion(found.poses, found.trans, found.betas, found.rate, none, gender=found.gender,
-                      trusted=none.astype(bool))
+    def of(motion: BodyMotion) -> Motion:
+        """Make a motion that does not come from markers.
+
+        Parameters
+        ----------
+        motion : BodyMotion
+            Poses, places and shape.
+
+        Returns
+        -------
+        Motion
+            Without markers.
+        """
+        no_markers = np.zeros((len(motion.poses), 0))
+        return Motion(motion.poses, motion.trans, motion.betas, motion.rate, no_markers, gender=motion.gender,
+                      trusted=no_markers.astype(bool))
 
     @staticmethod
     def load(path: str | Path, rate: float | None = None) -> Motion:
         """Read a file of `save`, or a body-model motion file of the same kind from elsewhere.
 
-        `rate` is frames a second, where the file does not say or says it wrongly.
+        Parameters
+        ----------
+        path : str or Path
+            File to read.
+        rate : float, frames per second, optional
+            Where the file does not say, or says it wrongly.
+
+        Returns
+        -------
+        Motion
+
+        Raises
+        ------
+        ValueError
+            The file holds another kind of motion, or is damaged.
         """
-        # what else our files hold
+        # arrays that only scapekit writes; files from elsewhere lack them
         stored = read_motion_file(path, ("marker_residuals", "marker_labels", "converged", "marker_trusted"), rate=rate)
         check_ours(path, stored, f"; scape animate {Path(path).name} -m MODEL -o OUT puts it on a model")
         with storage.taking_apart(path, "a whole motion"):

@@ -19,58 +19,59 @@ from scanprep.pictures.shading import Dots, Moving, Solid, contact_sheet, render
 
 from .motion import Motion
 
+# colours of markers, and of a body in frames that were lost
 MARKER, LOST = (0.85, 0.25, 0.2), (0.78, 0.78, 0.78)
-PLAYED, MOST_PLAYED = 30, 2000       # frames a second, and in all, that a page plays
-TURN = 35.0                          # degrees from the front of the body where the camera stands
+PLAYED, MOST_PLAYED = 30, 2000       # frames per second, and in total, that a page plays: smooth, not too large
+TURN = 35.0                          # degrees of the camera from the body's front: shows steps and depth
 
 
 def upwards(motion: Motion, subject: Subject) -> np.ndarray:
-    """(3,) what is up in a motion."""
+    """Find the direction (3,) that is up in a motion."""
     return stance(subject.template, rotations.exp(motion.poses[:, 0]))[0]
 
 
 def facing(subject: Subject, pose: np.ndarray, vertices: np.ndarray, turn: float = TURN,
            vertical: np.ndarray | None = None) -> Camera:
-    """A camera that sees a body (..., 3) from so many degrees beside its front, wherever it faces and whatever is up.
+    """Make a camera that sees a body (..., 3) from `turn` degrees beside its front, whichever way it faces.
 
-    `pose` (..., J, 3) is the body's, or all of its motion; for one frame of a motion `vertical` is what is up in it.
+    `pose` (..., J, 3) is the body's, or all of its motion. For a single frame pass the `vertical` of the whole motion.
     """
     return look_around(subject.template, vertices, (turn,), rotations.exp(pose[..., 0, :]), vertical)[0]
 
 
 def worst_frames(motion: Motion, count: int) -> np.ndarray:
-    """At most so many frames, in order: those with the largest mean residual, at least a quarter of a second apart."""
+    """Return at most `count` frames with the largest mean residual, in order, a quarter of a second apart."""
     off = np.nan_to_num(mean_over(motion.residuals, 1))
     return frames_apart(np.argsort(-off), count, motion.rate / 4)
 
 
 def frames_apart(frames: np.ndarray, count: int, apart: float) -> np.ndarray:
-    """In order the first frames of some, at most so many, that are no closer in time than `apart` frames."""
-    found: list[int] = []
+    """Choose the first `count` of some frames that are at least `apart` frames from each other; in order."""
+    chosen: list[int] = []
     for t in frames.tolist():
-        if len(found) < count and all(abs(t - other) >= apart for other in found):
-            found.append(t)
-    return np.sort(found).astype(int)
+        if len(chosen) < count and all(abs(t - other) >= apart for other in chosen):
+            chosen.append(t)
+    return np.sort(chosen).astype(int)
 
 
 @dataclass(frozen=True, eq=False)
 class LightMesh:
-    """Some of the vertices (n,) of a body and triangles (f, 3) between them, for small pictures and for motions."""
+    """Some vertices (n,) of a body and triangles (f, 3) between them, for small pictures and motions."""
 
     vertex_ids: np.ndarray
     faces: np.ndarray
 
     @staticmethod
     def of(template: Mesh) -> LightMesh:
-        """At most `LIGHT` triangles; of a body that has no more its own."""
-        light = 7000  # triangles of a body in small pictures and in motion
+        """Simplify a template; one with few triangles is kept."""
+        light = 7000  # triangles that suffice for small pictures and motions
         if len(template.faces) <= light:
             return LightMesh(np.arange(len(template.vertices)), template.faces)
         small = decimate_set(template, None, light)
         return LightMesh(small.vertex_map, small.template.faces)
 
     def mesh(self, vertices: np.ndarray) -> Mesh:
-        """The small mesh of a large one's vertices (N, 3)."""
+        """Return the small mesh of a full body's vertices (N, 3)."""
         return Mesh(vertices[self.vertex_ids], self.faces)
 
 
@@ -78,7 +79,7 @@ Bodies = Callable[[np.ndarray], np.ndarray]            # frames (n,) -> vertices
 
 
 def frames_to_play(motion: Motion) -> tuple[np.ndarray, float]:
-    """The frames that a page plays, and how many a second."""
+    """Return the frames that a page plays, and how many per second."""
     step = max(1, round(motion.rate / PLAYED), -(-len(motion.poses) // MOST_PLAYED))
     return np.arange(0, len(motion.poses), step), motion.rate / step
 
@@ -86,63 +87,84 @@ def frames_to_play(motion: Motion) -> tuple[np.ndarray, float]:
 def moving_pane(motion: Motion, subject: Subject, dots: Sequence[tuple[Dots, np.ndarray]] = (),
                 bodies: Bodies | None = None, light: LightMesh | None = None, label: str = "",
                 color: Sequence[float] | None = None) -> Pane:
-    """A body in motion with dots at places (n, L, 3) in the frames `played`; it stays in the middle of the picture.
+    """Make a pane of a body in motion, with dots; the body stays in the middle of the picture.
 
-    Lost frames are grey. `bodies` says what it looks like, if not as the subject.
+    Parameters
+    ----------
+    motion : Motion
+        The motion; frames that did not converge are grey.
+    subject : Subject
+        The body that moves.
+    dots : sequence of (Dots, (n, L, 3) float in metres)
+        Dots, and their places in the frames of `frames_to_play`.
+    bodies : callable, optional
+        Returns vertices (n, N, 3), metres, of frames (n,), if not those of the subject.
+    light : LightMesh, optional
+        The simplified mesh, if it is known already.
+    label : str
+        Title of the pane.
+    color : (3,) float, optional
+        Colour of the body.
+
+    Returns
+    -------
+    Pane
     """
     frames, rate = frames_to_play(motion)
     light = light or LightMesh.of(subject.template)
-    make = bodies or (lambda some: motion.vertices(subject, some))
-    # 128 bodies are held at a time
+    make = bodies or (lambda chosen: motion.vertices(subject, chosen))
+    # 128 full bodies in memory at a time
     shown = np.concatenate([make(frames[i:i + 128])[:, light.vertex_ids].astype(np.float32)
                             for i in range(0, len(frames), 128)])
     vertical = upwards(motion, subject)
+    # follow the body horizontally, not up and down
     middle = shown.mean(axis=1, keepdims=True) * (1 - np.abs(vertical)).astype(np.float32)
     shown -= middle
     first, lost = Mesh(shown[0].astype(float), light.faces), ~motion.converged[frames]
     shapes: list[Moving] = []
+    # two shapes, of which each frame shows one: the body, or the grey body where it was lost
     for mask, name, look in ((~lost, "body", color), (lost, "lost frames", LOST)):
         if mask.any():
             seen = shown if mask.all() else np.where(mask[:, None, None], shown, np.float32(np.nan))
             shapes.append(Moving(Solid(first, look, name=name), seen, rate))
-    shapes += [Moving(replace(these, points=(at - middle)[0]), at - middle, rate) for these, at in dots]
+    shapes += [Moving(replace(one, points=(place - middle)[0]), place - middle, rate) for one, place in dots]
     camera = facing(subject, motion.poses, shown[:: max(1, len(shown) // 50)].reshape(-1, 3))
     return Pane(shapes, camera, label)
 
 
 def pane_with_dots(motion: Motion, subject: Subject, places: np.ndarray, name: str, labels: Sequence[str],
                    on_top: bool = False) -> Pane:
-    """A body in motion with the places (T, L, 3), metres, that it follows."""
+    """Make a pane of a body in motion with the places (T, L, 3), metres, that it follows."""
     at = places[frames_to_play(motion)[0]]
     return moving_pane(motion, subject, [(Dots(at[0], MARKER, 0.013, on_top, name=name, labels=labels), at)])
 
 
 def frame_panes(motion: Motion, subject: Subject, markers: np.ndarray | None, frames: np.ndarray, turn: float = TURN
                 ) -> list[Pane]:
-    """Some frames, the measured markers (T, L, 3), metres, as dots."""
+    """Make a pane for each of some frames, with measured markers (T, L, 3), metres, as dots."""
     panes, light, vertical = [], LightMesh.of(subject.template), upwards(motion, subject)
-    for t, vertices, told in zip(frames, motion.vertices(subject, frames), seconds(motion, frames), strict=True):
+    for t, vertices, time in zip(frames, motion.vertices(subject, frames), seconds(motion, frames), strict=True):
         dots = [] if markers is None else [Dots(markers[t], MARKER, radius=0.013)]
         camera = facing(subject, motion.poses[t], vertices, turn, vertical)
-        panes.append(Pane([light.mesh(vertices), *dots], camera, told))
+        panes.append(Pane([light.mesh(vertices), *dots], camera, time))
     return panes
 
 
 def seconds(motion: Motion, frames: np.ndarray) -> list[str]:
-    """When frames are."""
+    """Return the times of frames as text."""
     return [f"{t / motion.rate:.2f} s" for t in frames]
 
 
 def bodies_in_a_row(subject: Subject, poses: np.ndarray, bodies: np.ndarray, colors: np.ndarray | None = None,
                     height: int = 360, turn: float = TURN) -> list[np.ndarray]:
-    """Pictures of bodies (n, N, 3) in poses (n, J, 3), all of one scale; `colors` (n, N, 3) of their vertices."""
+    """Render bodies (n, N, 3) in poses (n, J, 3) at one scale; `colors` (n, N, 3) are of their vertices."""
     size, images = 1.06 * np.ptp(bodies, axis=1).max(axis=0) / 2, []
     vertical = stance(subject.template, rotations.exp(poses[:, 0]))[0]
     up, sign = int(np.abs(vertical).argmax()), vertical.sum()
     floor = sign * (sign * bodies[..., up]).min()
     for i, body in enumerate(bodies):
         middle = (body.min(axis=0) + body.max(axis=0)) / 2
-        middle[up] = floor + sign * size[up] / 1.06                        # all on one line
+        middle[up] = floor + sign * size[up] / 1.06                        # all stand on one line
         camera = facing(subject, poses[i], np.stack([middle - size, middle + size]), turn, vertical)
         images.append(render(Solid(subject.template.with_vertices(body), None if colors is None else colors[i]), camera,
                              int(0.62 * height), height))
@@ -151,14 +173,14 @@ def bodies_in_a_row(subject: Subject, poses: np.ndarray, bodies: np.ndarray, col
 
 def picture_bodies(motion: Motion, subject: Subject, bodies: np.ndarray, frames: np.ndarray, count: int = 8
                    ) -> np.ndarray:
-    """Some of the meshes (n, N, 3) of a body that changes side by side, at one scale; `frames` (n,) is when."""
+    """Render some meshes (n, N, 3) of a changing body side by side, at one scale; `frames` (n,) is when."""
     chosen = spread_indices(len(frames), count)
     return contact_sheet(bodies_in_a_row(subject, motion.poses[frames[chosen]], bodies[chosen]),
                          seconds(motion, frames[chosen]))
 
 
 def mean_over(values: np.ndarray, axis: int) -> np.ndarray:
-    """The mean of what is not NaN, NaN where there is nothing."""
+    """Compute the mean of all values that are not NaN; NaN where there are none."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", RuntimeWarning)
         return np.nanmean(values, axis=axis)
@@ -166,10 +188,10 @@ def mean_over(values: np.ndarray, axis: int) -> np.ndarray:
 
 def marker_rows(labels: Sequence[str], residuals: np.ndarray, soft: np.ndarray | None, trusted: np.ndarray | None
                 ) -> list[tuple[Any, ...]]:
-    """A table of markers, the worst first: label, mean distances (mm), 95th percentile, seen and believed (%).
+    """Make a table of markers, the worst first: label, mean distances (mm), 95th percentile, seen and trusted (%).
 
-    Distances (T, L) are of the fixed shape and, if there is one, of the changing one, which then is that of the
-    percentile. Markers that were never seen are left out, unless nothing is told of trust in them.
+    Distances (T, L) are from the body of fixed shape, and if given from the `soft` one, to which the percentile refers.
+    Markers that were never seen are left out, unless `trusted` is None.
     """
     out = []
     for i, label in enumerate(labels):
@@ -184,7 +206,7 @@ def marker_rows(labels: Sequence[str], residuals: np.ndarray, soft: np.ndarray |
 
 
 def chart(width: float, height: float) -> tuple[Any, Any]:
-    """A matplotlib figure of this size, inches, and its axes."""
+    """Make a matplotlib figure of this size, inches, and its axes."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(width, height))
@@ -192,13 +214,14 @@ def chart(width: float, height: float) -> tuple[Any, Any]:
 
 
 def chart_residuals(motion: Motion, what: str = "markers", lost: bool = False) -> Any:
-    """A matplotlib figure: the distance of the markers from the body over time; `lost` frames shaded where wanted."""
+    """Draw the distance of the markers from the body over time; with `lost`, lost frames are shaded."""
     figure, axes = chart(7.5, 2.6)
     shown = np.isfinite(motion.residuals).any(axis=1)
     millimetres = 1000 * motion.residuals[shown]
     axes.fill_between(motion.times[shown], *np.nanpercentile(millimetres, [10, 90], axis=1), alpha=0.25,
                       label="10th to 90th percentile", linewidth=0)
     axes.plot(motion.times[shown], np.nanmean(millimetres, axis=1), linewidth=1.2, label="mean")
+    # begin and end of every run of lost frames
     edges = np.flatnonzero(np.diff(np.r_[True, motion.converged, True])) if lost else np.zeros(0, dtype=int)
     for i, span in enumerate((edges.reshape(-1, 2) - 0.5) / motion.rate):
         axes.axvspan(*span, color="0.85", label="lost" if i == 0 else None)
@@ -209,13 +232,14 @@ def chart_residuals(motion: Motion, what: str = "markers", lost: bool = False) -
 
 def chart_states(state: np.ndarray, labels: Sequence[str], rate: float, colors: Sequence[str],
                  names: Sequence[str] = ()) -> Any:
-    """A matplotlib figure: the state (T, L) int of every marker over time, the highest where frames fall together.
+    """Draw the state (T, L) int of every marker over time; where frames share a pixel, the highest.
 
-    Each state has a colour; of the names those that occur are shown below.
+    Each state has a colour; the legend shows the names of those that occur.
     """
     from matplotlib.colors import ListedColormap
     from matplotlib.patches import Patch
 
+    # 600 columns are as many as the chart has pixels
     steps = np.array_split(np.arange(len(state)), min(len(state), 600))
     shown = np.array([state[part].max(axis=0) for part in steps])
     figure, axes = chart(7.5, 0.6 + 0.13 * len(labels))

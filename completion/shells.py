@@ -1,4 +1,4 @@
-"""The command `scape completion`: the script by which a shell completes all commands and their flags."""
+"""The command `scape completion`: the script with which a shell completes commands and flags."""
 from __future__ import annotations
 
 import argparse
@@ -33,7 +33,7 @@ def write_shell(shell: ShellArg) -> Outcome:
 
 
 def _add(parser: argparse.ArgumentParser, commands: Mapping[str, tuple[str, str]], prog: str) -> None:
-    """The commands of a group, with all below them, as parsers below its own."""
+    """Add the commands of a group, and everything below, as subparsers."""
     below = parser.add_subparsers()
     for name, (text, target) in commands.items():
         function, path = load_command(target), f"{prog} {name}"
@@ -45,7 +45,7 @@ def _add(parser: argparse.ArgumentParser, commands: Mapping[str, tuple[str, str]
 
 
 def _offer(argument: Argument, action: argparse.Action) -> None:
-    """What the shell offers as the value of an argument: its choices, or files."""
+    """Set what the shell offers as value of an argument: its choices, or files."""
     import shtab
 
     if argument.choices:

@@ -1,4 +1,4 @@
-"""Some surface points of a body whose shape is free."""
+"""Chosen surface points of a body whose shape coefficients (betas) are unknown."""
 from __future__ import annotations
 
 from abc import abstractmethod
@@ -23,27 +23,27 @@ class ShapedPoints(SurfaceCombination):
 
     @abstractmethod
     def operator(self, betas: np.ndarray | None = None) -> PointOperator:
-        """The points of the body with betas (k,), k ≤ K; None is the template's own body."""
+        """Return the points of the body with betas (k,), k ≤ K; None is the template's own body."""
 
     @abstractmethod
     def shape_jacobian(self, pose: np.ndarray) -> np.ndarray:
-        """Derivative (..., L, 3, K) of the points with respect to betas at poses (..., J, 3), metres."""
+        """Compute the derivative (..., L, 3, K) of the points by the betas at poses (..., J, 3), metres."""
 
     @abstractmethod
     def combine(self, weights: np.ndarray | sparray) -> ShapedPoints:
-        """Linear combinations of the points, with weights (n, L) whose rows sum to 1."""
+        """Form n linear combinations of the points, with weights (n, L) whose rows sum to 1."""
 
     @abstractmethod
     def concatenate(self, other: ShapedPoints) -> ShapedPoints:
-        """These points and then others of the same model."""
+        """Append other points of the same model to these."""
 
     @abstractmethod
     def along(self, directions: np.ndarray) -> ShapedPoints:
-        """The same in other unknowns z (k,): betas are z @ directions (k, K)."""
+        """Replace the betas by other unknowns z (k,), where betas = z @ directions and directions is (k, K)."""
 
     @abstractmethod
     def first(self, n_betas: int) -> ShapedPoints:
-        """The same with the first betas only."""
+        """Keep only the first betas."""
 
     def _check_betas(self, betas: np.ndarray) -> np.ndarray:
         betas = np.asarray(betas, dtype=np.float64)
@@ -61,27 +61,28 @@ class PosedPoints:
     source: PointOperator | ShapedPoints
 
     @property
-    def J3(self) -> int:
+    def n_angles(self) -> int:
         """Three times the number of parts."""
         return 3 * len(self.source.skeleton.parents)
 
     @property
     def n_unknowns(self) -> int:
-        """P."""
-        return self.J3 + 3 + (self.source.n_betas if isinstance(self.source, ShapedPoints) else 0)
+        """P, the number of unknowns: 3J for the pose, 3 for the place, K for the betas."""
+        return self.n_angles + 3 + (self.source.n_betas if isinstance(self.source, ShapedPoints) else 0)
 
     def positions(self, x: np.ndarray) -> np.ndarray:
-        """(L, 3) metres."""
-        return self._operator(x).evaluate(x[:self.J3].reshape(-1, 3), x[self.J3:self.J3 + 3])
+        """Compute the positions (L, 3), metres, at unknowns x (P,)."""
+        return self._operator(x).evaluate(x[:self.n_angles].reshape(-1, 3), x[self.n_angles:self.n_angles + 3])
 
     def columns(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Positions (L, 3) and their derivatives (P, 3, L)."""
-        pose = x[:self.J3].reshape(-1, 3)
-        y, by_pose = self._operator(x).columns(pose, x[self.J3:self.J3 + 3])
+        """Compute the positions (L, 3), metres, and their derivatives (P, 3, L) at unknowns x (P,)."""
+        pose = x[:self.n_angles].reshape(-1, 3)
+        y, by_pose = self._operator(x).columns(pose, x[self.n_angles:self.n_angles + 3])
+        # derivatives by the pose, by the place (the identity), and by the betas where the shape is unknown
         blocks = [by_pose, np.broadcast_to(np.eye(3)[..., None], (3, 3, len(y)))]
         if isinstance(self.source, ShapedPoints):
             blocks.append(np.swapaxes(self.source.shape_jacobian(pose), 0, 2))
         return y, np.concatenate(blocks)
 
     def _operator(self, x: np.ndarray) -> PointOperator:
-        return self.source if isinstance(self.source, PointOperator) else self.source.operator(x[self.J3 + 3:])
+        return self.source if isinstance(self.source, PointOperator) else self.source.operator(x[self.n_angles + 3:])

@@ -1,4 +1,4 @@
-"""What every kind of body model offers, whatever it is made of."""
+"""`BodyModel`: what every kind of body model offers."""
 from __future__ import annotations
 
 import importlib.metadata
@@ -28,9 +28,9 @@ VERSION = 3                          # of model files: 1 and 2 had fewer kinds o
 
 @dataclass(frozen=True, eq=False)
 class Derivatives:
-    """Vertices (L, 3), metres, and how they change: by pose (L, 3, 3J), metres per radian, and by betas (L, 3, k).
+    """Vertices (L, 3), metres, with derivatives by the pose (L, 3, 3J), metres per radian, and the betas (L, 3, k).
 
-    k = 0 where the body is the template's own, which has no betas. By trans it is the identity for every vertex.
+    k = 0 for the template's own body, which has no betas. The derivative by trans is the identity for every vertex.
     """
 
     vertices: np.ndarray
@@ -41,22 +41,25 @@ class Derivatives:
 class BodyModel(ABC):
     """A body as a function of pose, shape and place, with derivatives.
 
-    A kind of model says its features, betas and surface points (`points`), what its file holds besides (`arrays`,
-    `restore`), and stands in the table of `model.files`; all else follows from these. What can be made faster or
-    better than that for a kind, it overrides; what needs to know how it is made (`resample`, `recentre`,
-    `exact_subject`) is refused until it does.
+    This is the common interface of `ScapeModel`, `BlendScapeModel` and `SkinningModel`. A new kind of model defines its
+    features, betas and surface points (`points`), and what its file adds (`arrays`, `restore`). It also gets a line in
+    the table `KINDS` of `model.files`. All else follows; a kind may override methods to make them faster. `resample`,
+    `recentre` and `exact_subject` raise ValueError for kinds that do not define them.
 
     Attributes
     ----------
     kind : str
         The name of the kind of model in files.
     template : Mesh
+        N vertices, F triangles.
     skeleton : Skeleton
+        J parts and their joints.
     pose_mean : (J, 3) float, radians
+        Mean of the training poses.
     pose_covariance : (3J, 3J) float, square radians
-        Of the training poses, zero in the root's rows: a Gaussian prior of the pose.
+        Of the training poses, zero in the root's rows. With the mean it is a Gaussian pose prior.
     pose_examples : (M, J, 3) float, radians
-        The training poses themselves, and those in which the people of the training set stand, the root not turned;
+        The training poses, and the poses in which the people of the training set stand; the root is not turned.
         M = 0 in files of earlier versions.
     info : dict
         How the model was made: settings, sizes and a digest of the training set.
@@ -64,6 +67,15 @@ class BodyModel(ABC):
         The functions of the pose that the deformation by pose is linear in.
     regressor : (J, N) sparse or None
         Joints as combinations of vertices, where a model has its own; else those of the skeleton's rings.
+
+    Examples
+    --------
+    >>> from model import load_built_in_model
+    >>> model = load_built_in_model()
+    >>> model.vertices(np.zeros((16, 3)), betas=np.zeros(10)).shape
+    (5002, 3)
+
+    [SCAPE] Eq. 6
     """
 
     kind: ClassVar[str]
@@ -87,7 +99,7 @@ class BodyModel(ABC):
     @property
     @abstractmethod
     def explained(self) -> np.ndarray:
-        """(K,) share of the training people's variance that the first 1..K components explain."""
+        """(K,) share of the shape variance of the training people that the first 1..K components explain."""
 
     @property
     def n_features(self) -> int:
@@ -102,7 +114,7 @@ class BodyModel(ABC):
     @abstractmethod
     def points(self, vertex_ids: np.ndarray, weights: np.ndarray | None = None, n_betas: int | None = None
                ) -> ShapedPoints:
-        """Some surface points as a function of pose, betas and place, without touching the mesh again.
+        """Build the fast path of chosen surface points as a function of pose, betas and place.
 
         Parameters
         ----------
@@ -118,30 +130,32 @@ class BodyModel(ABC):
         return self.points(np.arange(len(self.template.vertices)))
 
     def operator(self, betas: np.ndarray | None = None) -> PointOperator:
-        """All vertices of the body with betas (k,), k ≤ K, as a function of the pose; None is the template's own."""
+        """Build the fast path of all vertices with betas (k,), k ≤ K, held; None is the template's own body."""
         return self.everywhere.operator(betas)
 
     def vertices_of(self, pose: np.ndarray, betas: np.ndarray | None) -> np.ndarray:
-        """Vertices (N, 3), metres, of one checked pose (J, 3) and betas (k,), the template's root joint in the
-        origin.
+        """Compute the vertices (N, 3), metres, at one checked pose (J, 3) and betas (k,).
+
+        The template's root joint is in the origin.
         """
         return self.operator(betas).evaluate(pose) - self.skeleton.joints[0]
 
     def bodies_of(self, poses: np.ndarray, betas: np.ndarray) -> np.ndarray:
-        """Vertices (B, N, 3), metres, of checked poses (B, J, 3) and betas (B, k).
+        """Compute the vertices (B, N, 3), metres, at checked poses (B, J, 3) and betas (B, k).
 
-        As `vertices_of` one by one, up to rounding; a few dozen at once are made fastest.
+        The result is that of `vertices_of` one by one, up to rounding. Batches of a few dozen are fastest.
         """
         return np.array([self.vertices_of(*each) for each in zip(poses, betas, strict=True)])
 
     def shape_jacobian(self, pose: np.ndarray, vertex_ids: np.ndarray | None = None) -> np.ndarray:
-        """Derivative of the vertices with respect to betas.
+        """Compute the derivative of the vertices by the betas.
 
         Vertices are affine in betas, so it depends on the pose alone.
 
         Parameters
         ----------
         pose : (J, 3) float, radians
+            One pose.
         vertex_ids : (L,) int, optional
             Of these vertices only.
 
@@ -153,44 +167,48 @@ class BodyModel(ABC):
         return (self.everywhere if vertex_ids is None else self.points(vertex_ids)).shape_jacobian(pose)
 
     def pull_back(self, force: np.ndarray, pose: np.ndarray, betas: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Gradient (3J,), (k,) by pose (J, 3) and betas (k,) of a function with gradient `force` (N, 3) by the
-        vertices.
+        """Compute the gradient by pose (3J,) and betas (k,) of a function with gradient `force` (N, 3) by the vertices.
 
-        It costs about as much as the vertices themselves where a kind of model goes backwards through itself.
+        Kinds with reverse-mode differentiation of their own need about the time of one evaluation of the vertices.
         """
-        found = self.jacobian(pose, betas)
-        return np.einsum("nd,ndp->p", force, found.pose), np.einsum("nd,ndk->k", force, found.betas)
+        derivatives = self.jacobian(pose, betas)
+        return np.einsum("nd,ndp->p", force, derivatives.pose), np.einsum("nd,ndk->k", force, derivatives.betas)
 
     @cached_property
     def skin_weights(self) -> np.ndarray:
-        """(N, J) how much each part carries each vertex where the body is skinned, rows sum to 1."""
+        """(N, J) blend weights of the vertices for linear blend skinning; rows sum to 1."""
         return skin_weights(self.template, self.skeleton)
 
     def rest_joints(self, betas: np.ndarray | None) -> np.ndarray:
-        """Joints (J, 3), metres, at zero pose of the body with betas (k,), k ≤ K; None is the template's own."""
+        """Compute the joints (J, 3), metres, at zero pose for betas (k,), k ≤ K; None is the template's own body."""
         return np.asarray(self.joint_regressor @ self.vertices(np.zeros(self.skeleton.joints.shape), betas))
 
     @property
     def pose_directions(self) -> np.ndarray | None:
-        """(N, 3, 9 (J - 1)) metres, change of the rest vertices by the rotations of the joints less the identity; None
-        for a kind that is not linear in these.
+        """(N, 3, 9 (J - 1)) metres: pose-corrective shapes, the change of the rest vertices by `R - I` of the joints.
+
+        None for a kind of model that is not linear in these.
         """
         return None
 
     def resample(self: Model, template: Mesh, skeleton: Skeleton, rounds: int, progress: Progress) -> Model:
-        """The model on other triangles of its template's surface, which have these parts; see `change_resolution`."""
+        """Transfer the model to other triangles of its template's surface; see `change_resolution`."""
         raise ValueError(f"model: the resolution of the kind '{self.kind}' cannot be changed")
 
     def recentre(self: Model, vertices: np.ndarray, pose: np.ndarray) -> Model:
-        """The model whose mean person is in the pose (J, 3) the character with vertices (N, 3), metres."""
+        """Replace the mean person by a character, given by its vertices (N, 3), metres, in a pose (J, 3)."""
         raise ValueError(f"model: the kind '{self.kind}' cannot take a character")
 
     def exact_subject(self, vertices: np.ndarray, pose: np.ndarray, betas: np.ndarray | None) -> Subject:
-        """The subject that in a pose (J, 3) is the body with vertices (N, 3), metres, which betas (k,) come near."""
+        """Build the subject that reproduces a registered body (N, 3), metres, at a pose (J, 3).
+
+        `betas` (k,) are those whose body comes nearest; what they leave over is added.
+        """
         raise ValueError(f"model: the kind '{self.kind}' cannot take the shape of a registered body")
 
     def save(self, path: str | Path) -> None:
         """Write the model into one `.npz` file with a JSON header."""
+        # arrays that every kind of model has; the kind adds its own
         features, skeleton = self.features, self.skeleton
         arrays = {
             "vertices": self.template.vertices, "faces": self.template.faces.astype(np.int32),
@@ -213,33 +231,35 @@ class BodyModel(ABC):
 
     @abstractmethod
     def arrays(self) -> dict[str, np.ndarray]:
-        """What a file of this kind holds besides what all have."""
+        """Return the arrays that files of this kind hold besides the common ones."""
 
     def notes(self) -> dict[str, Any]:
-        """What the header of its file says besides."""
+        """Return the entries that file headers of this kind hold besides the common ones."""
         return {}
 
     @classmethod
     @abstractmethod
     def restore(cls: type[Model], parts: dict[str, Any], features: PoseFeatures, header: Mapping[str, Any],
                 arrays: Mapping[str, np.ndarray]) -> Model:
-        """The model of a file: fields that all kinds have (`restore_parts`), features, the header, the arrays.
+        """Build the model from the contents of its file: common fields (`restore_parts`), features, header, arrays.
 
-        KeyError, TypeError or ValueError for what is missing or does not fit the rest.
+        Raises KeyError, TypeError or ValueError for what is missing or does not fit the rest.
         """
 
     def vertices(self, pose: np.ndarray, betas: np.ndarray | None = None, trans: np.ndarray | None = None
                  ) -> np.ndarray:
-        """Vertices for one pose or a batch, the exact way.
+        """Compute the vertices for one pose or a batch.
 
-        For many poses of one body, `subject(betas).vertices` is far faster and agrees.
+        For many poses of one body, `subject(betas).vertices` gives the same result far faster.
 
         Parameters
         ----------
         pose : (J, 3) or (B, J, 3) float, radians
+            One pose or a batch.
         betas : (k,) or (B, k) float, k ≤ K, optional
             None is the template's own body.
-        trans : (3,) or (B, 3) float, metres
+        trans : (3,) or (B, 3) float, metres, optional
+            Travel of the root's joint.
 
         Returns
         -------
@@ -250,19 +270,21 @@ class BodyModel(ABC):
         ValueError
             A pose, betas or trans of the wrong shape or not finite.
         """
+        # one pose with several betas: the pose is repeated
         if betas is not None and np.ndim(betas) == 2 and np.ndim(pose) == 2:
             pose = np.repeat(np.asarray(pose)[None], len(betas), axis=0)
         pose, trans = check_pose(self.skeleton, pose, trans)
         if betas is not None and np.ndim(betas) == 2 and np.shape(betas)[:1] != pose.shape[:-2]:
             raise ValueError(f"betas: expected as many rows as poses, {pose.shape[:-2]}, got shape {np.shape(betas)}")
+        # one exact evaluation a pose, then all are placed
         out = np.empty((*pose.shape[:-2], *self.template.vertices.shape))
         for b in np.ndindex(*pose.shape[:-2]):
-            mine = None if betas is None else np.asarray(betas)[b] if np.ndim(betas) == 2 else betas
-            out[b] = self.vertices_of(pose[b], mine)
+            own_betas = None if betas is None else np.asarray(betas)[b] if np.ndim(betas) == 2 else betas
+            out[b] = self.vertices_of(pose[b], own_betas)
         return out + (self.skeleton.joints[0] + trans)[..., None, :]
 
     def subject(self, betas: np.ndarray | None = None, dtype: Any = np.float64) -> Subject:
-        """The body of one person, ready to be posed fast.
+        """Build the body of one person, ready to be posed fast.
 
         Parameters
         ----------
@@ -274,7 +296,7 @@ class BodyModel(ABC):
         Raises
         ------
         ValueError
-            Another type: metres would be cut.
+            Another type, whose rounding would be visible.
         """
         if np.dtype(dtype) not in (np.float32, np.float64):
             raise ValueError(f"dtype: expected float32 or float64, got {np.dtype(dtype)}")
@@ -282,7 +304,7 @@ class BodyModel(ABC):
                                None if betas is None else np.array(betas, dtype=np.float64))
 
     def subject_of(self, operator: PointOperator, betas: np.ndarray | None) -> Subject:
-        """A subject with what the model knows of its poses, of any operator of all vertices."""
+        """Build a subject from an operator of all vertices, with the model's pose prior."""
         return Subject(self.template, self.skeleton, betas, operator, self.pose_mean, self.pose_covariance,
                        self.pose_examples, self.info.get("left_out_error"), self.regressor)
 
@@ -298,21 +320,24 @@ class BodyModel(ABC):
 
     def jacobian(self, pose: np.ndarray, betas: np.ndarray | None = None, trans: np.ndarray | None = None,
                  vertex_ids: np.ndarray | None = None) -> Derivatives:
-        """Vertices at one pose with their derivatives with respect to pose parameters and betas.
+        """Compute the vertices at one pose with their derivatives by the pose parameters and the betas.
 
         Parameters
         ----------
         pose : (J, 3) float, radians
+            One pose.
         betas : (k,) float, k ≤ K, optional
-        trans : (3,) float, metres
+            None is the template's own body.
+        trans : (3,) float, metres, optional
+            Travel of the root's joint.
         vertex_ids : (L,) int, optional
             Of these vertices only.
         """
         N, K = len(self.template.vertices), 0 if betas is None else len(betas)
-        # share of the vertices beyond which derivatives are made for all of them
-        few = vertex_ids is not None and len(vertex_ids) < 0.25 * N
+        # up to a quarter of the vertices, the fast path of those alone is cheaper than tables of all
+        by_points = vertex_ids is not None and len(vertex_ids) < 0.25 * N
         ids = np.arange(N) if vertex_ids is None else np.asarray(vertex_ids)
-        if few:
+        if by_points:
             shaped = self.points(ids, n_betas=K)
             y, by_pose = shaped.operator(betas).jacobian(pose, trans)
             return Derivatives(y, by_pose, shaped.shape_jacobian(pose))
@@ -322,19 +347,21 @@ class BodyModel(ABC):
 
 
 def restore_parts(header: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> dict[str, Any]:
-    """What every kind of model has, from a file of it; files of earlier versions may have no pose examples.
+    """Read the fields that every kind of model has; files of earlier versions may have no pose examples.
 
-    KeyError, TypeError or ValueError for what is missing or does not fit the rest.
+    Raises KeyError, TypeError or ValueError for what is missing or does not fit the rest.
     """
     J = len(np.atleast_1d(arrays["parents"]))
     skeleton = Skeleton(storage.numbers(arrays, "part_of_face", None, kinds="iu"),
                         storage.numbers(arrays, "parents", J, kinds="iu"),
                         storage.numbers(arrays, "joints", J, 3, kinds="f"), tuple(header["names"]))
+    # the template, and whether the parts belong to its triangles
     template = Mesh(storage.numbers(arrays, "vertices", None, 3, kinds="f"),
                     storage.numbers(arrays, "faces", None, 3, kinds="iu"))
     if len(skeleton.part_of_face) != len(template.faces):
         raise ValueError(f"part_of_face: expected one of {len(template.faces)} faces, "
                          f"found {len(skeleton.part_of_face)}")
+    # landmarks are vertex numbers of the template
     info, N = header["info"], len(template.vertices)
     marks = info.get("landmarks") or {}
     if not all(isinstance(v, int) and 0 <= v < N for v in marks.values()):
@@ -348,16 +375,17 @@ def restore_parts(header: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -
 
 
 def restore_variances(arrays: Mapping[str, np.ndarray], total: str) -> tuple[np.ndarray, float]:
-    """Variances (K,) of the shape components and the variance in all directions, from a model file."""
+    """Read the variances (K,) of the shape components and the total variance from a model file."""
     variances = storage.numbers(arrays, "shape_variances", None)
     whole = float(storage.numbers(arrays, total))
+    # components cannot explain more than the total variance, up to 1% of rounding
     if not (variances >= 0).all() or variances.sum() > 1.01 * whole:
         raise ValueError(f"{total}: expected the sum of shape_variances or more, found {whole:g}")
     return variances, whole
 
 
 def writer_versions() -> dict[str, str]:
-    """What wrote a file."""
+    """Return the versions of the programs that write a file."""
     try:
         ours = importlib.metadata.version("scapekit")
     except importlib.metadata.PackageNotFoundError:

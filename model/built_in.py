@@ -1,7 +1,7 @@
-"""The built-in people as a body model: in the wheel, ready at once, for whoever has no scans of people.
+"""The built-in body model of people, for users without scans of their own.
 
-The shape space is that of `scanprep.synthetic.population`, exactly: the vertices of a body at rest are linear in its
-betas. The deformation by pose was learned from posed bodies of the synthetic people, by `tests/people/make_model.py`.
+The shape space is exactly that of `scanprep.synthetic.population`: vertices at rest are linear in the betas. The
+deformation by pose was learned from posed synthetic bodies by `tests/people/make_model.py`.
 """
 from __future__ import annotations
 
@@ -54,14 +54,17 @@ def load_built_in_model() -> ScapeModel:
     [SCAPE] Eq. 6
     """
     header, a = storage.load(STORED, KIND, (VERSION,))
+    # the template: vertices of the mean person that the coarser mesh keeps
     people, kept = population(), a["people_vertices"].astype(np.int64)
     rows = people.rows(np.zeros(0))
     template = Mesh(rows[kept], a["faces"].astype(np.int64))
     part = a["part_of_face"].astype(np.int64)
+    # joints of the population; the root's is the centroid of its part's vertices
     skeleton = Skeleton(part, PARENTS, rows[len(people.weights):len(people.weights) + 16], PARTS)
     joints = skeleton.joints.copy()
     joints[0] = template.vertices[skeleton.part_of_vertex(template) == 0].mean(axis=0)
     skeleton = Skeleton(part, PARENTS, joints, PARTS)
+    # learned deformation by pose, stored in 16 bits
     features = PoseFeatures(skeleton, LIFTS[header["lift"]], a["feature_part"].astype(np.int64), a["feature_mix"])
     space = PoseSpace(features, unpack_coefficients(features, a["pose_coefficients"], a["pose_scales"]))
     info = {"name": NAME, **header["info"], "people_vertices": kept.tolist(), "sexes": _sexes(people)}
@@ -70,10 +73,10 @@ def load_built_in_model() -> ScapeModel:
 
 
 def load_fingered_model() -> SkinningModel:
-    """Read the built-in people with bones in their fingers: for animators and for hands.
+    """Read the built-in people with finger bones: for animators and for hands.
 
-    The same people as `load_built_in_model`, all their 12,500 vertices, in linear blend skinning without correctives:
-    elbows and knees lose volume as they bend.
+    They are the people of `load_built_in_model` with all 12,500 vertices, in linear blend skinning without correctives.
+    So elbows and knees lose volume as they bend.
 
     Returns
     -------
@@ -88,16 +91,18 @@ def load_fingered_model() -> SkinningModel:
     header, a = storage.load(STORED, KIND, (VERSION,))
     people, n = population(), len(population().weights)
     parents, weights = list(PARENTS), np.hstack([people.weights, np.zeros((n, 30))])
+    # 16 parts of the body, then 15 finger bones of each hand
     regressor = lil_array((46, n))
     for j in range(16):
         regressor[[j], a["joint_vertices"][j]] = a["joint_weights"][j]
     left, share = a["hand_vertices"].astype(np.int64), a["finger_weights"] / 255.0
+    # the weight of a hand is divided among hand and finger bones; the right hand is the mirrored left
     for side, vertices, first in (("left", left, 16), ("right", people.mirror[left], 31)):
         hand, columns = PARTS.index(f"hand_{side}"), np.arange(first, first + 15)
         weights[vertices[:, None], columns] = weights[vertices, hand, None] * share[:, 1:]
         weights[vertices, hand] *= share[:, 0]
         parents += [hand if k % 3 == 0 else first + k - 1 for k in range(15)]
-        # a joint is amid the skin that both of its parts carry
+        # a finger joint is the mean of the skin that follows both of its parts
         for finger in columns:
             both = weights[:, finger] * weights[:, parents[finger]]
             near = np.flatnonzero(both)
@@ -112,16 +117,16 @@ def load_fingered_model() -> SkinningModel:
 
 
 def _sexes(people: Population) -> dict[str, Any]:
-    """Moments of the betas of each sex, as models keep them."""
+    """Return mean and covariance of the betas of each sex, as model files keep them."""
     return {sex: {"mean": mean.tolist(), "covariance": covariance.tolist()}
             for sex, (mean, covariance) in people.moments.items()}
 
 
 def shape_space(people: Population, kept: np.ndarray, template: Mesh, space: PoseSpace) -> ShapeSpace:
-    """Shape components whose bodies at rest are those of the population, for some of its vertices (n,).
+    """Compute shape components whose bodies at rest are those of the population, for some of its vertices (n,).
 
-    Two edges leave open how a triangle thickens: its normal grows as the square root of its area, as in [Sumner].
-    Found so, 16 people who were not learned from are met to 2.5 mm in random poses; with smoothness, Eq. 8, to 2.7.
+    Two edges do not determine how a triangle changes along its normal. As in [Sumner], the normal grows with the square
+    root of the area. On 16 people that were left out, in random poses, the error is 2.5 mm; with Eq. 8 it is 2.7 mm.
 
     [SCAPE] Eq. 7
     """
@@ -135,15 +140,17 @@ def shape_space(people: Population, kept: np.ndarray, template: Mesh, space: Pos
     size = np.linalg.norm(c, axis=-1, keepdims=True)
     n, dsize = c / np.sqrt(size), (c * dc).sum(axis=-1, keepdims=True) / size
     dn = (dc - 0.5 * c * dsize / size) / np.sqrt(size)
+    # S maps the two edges and the normal, so its derivative by a beta is their change times their inverse
     before = np.stack([e, f, n], axis=-2)
     components = np.swapaxes(np.linalg.inv(before) @ np.stack([de, df, dn], axis=-2), -1, -2)
+    # betas have unit variance, so a component's variance is its squared norm; S = I is the mean person
     variances = (components**2).sum(axis=(1, 2, 3))
     mean = np.broadcast_to(np.eye(3, dtype=np.float32), components.shape[1:]).copy()
     return ShapeSpace(mean, components.astype(np.float32), variances, float(variances.sum()))
 
 
 def pack_coefficients(space: PoseSpace) -> tuple[np.ndarray, np.ndarray]:
-    """All coefficients of a pose space in 16 bits, and the unit (A,) of every feature's: a third of the bytes."""
+    """Pack the coefficients of a pose space into 16 bits, with one unit (A,) a feature: a third of the bytes."""
     scales = np.concatenate([np.abs(a).max(axis=(1, 2, 3)) for a in space.coefficients]) / (2**15 - 1)
     scales = np.maximum(scales, np.finfo(np.float32).tiny)
     numbers = [a / scales[space.features.of_part(p)][:, None, None, None] for p, a in enumerate(space.coefficients)]
@@ -151,11 +158,11 @@ def pack_coefficients(space: PoseSpace) -> tuple[np.ndarray, np.ndarray]:
 
 
 def unpack_coefficients(features: PoseFeatures, packed: np.ndarray, scales: np.ndarray) -> tuple[np.ndarray, ...]:
-    """What `pack_coefficients` packed, part by part (n_p, F_p, 3, 3)."""
+    """Unpack the coefficients of `pack_coefficients`, part by part (n_p, F_p, 3, 3)."""
     out, start = [], 0
     for p, faces in enumerate(faces_of_part(features.skeleton)):
         unit = scales[features.of_part(p)]
-        some = packed[start:start + 9 * len(unit) * len(faces)].reshape(len(unit), len(faces), 3, 3)
-        out.append((some * unit[:, None, None, None]).astype(np.float32))
-        start += some.size
+        numbers = packed[start:start + 9 * len(unit) * len(faces)].reshape(len(unit), len(faces), 3, 3)
+        out.append((numbers * unit[:, None, None, None]).astype(np.float32))
+        start += numbers.size
     return tuple(out)

@@ -1,4 +1,4 @@
-"""`scape model`: look into a body model and pose it; what commands on models share."""
+"""`scape model`: the commands on body models, and what they share."""
 from __future__ import annotations
 
 from pathlib import Path
@@ -54,7 +54,7 @@ def info(model: ModelArg) -> Outcome:
     from .learning.scape import judge_model
 
     loaded = load_model(model)
-    # of a model's own notes: told in other rows, or for programs
+    # other entries of the model's notes; those left out have rows of their own or are for programs
     facts = [Metric(name.replace("_", " "), value) for name, value in loaded.info.items()
              if isinstance(value, str | int | float) and name not in ("left_out_error", "digest", "features")]
     return Outcome(None, [
@@ -88,21 +88,21 @@ def import_file(model: ModelArg, output: Output) -> Outcome:
     from .body_library import import_any
 
     with bar("learning how joints bend") as progress:
-        found = import_any(model, progress)
-    found.save(output)
-    off, notes = found.info.get("left_out_error"), found.info["notes"].split("; ")
+        imported = import_any(model, progress)
+    imported.save(output)
+    off, notes = imported.info.get("left_out_error"), imported.info["notes"].split("; ")
     return Outcome(output, [
         *([] if off is None else [Metric(LEFT_OUT, MM * float(off), "mm")]),
         *(Metric("note", note) for note in notes if note),
-        Metric("vertices", len(found.template.vertices)), Metric("triangles", len(found.template.faces)),
-        Metric("joints", len(found.skeleton.parents)), Metric("betas", found.n_betas),
-        Metric("pose columns", len(found.correctives)), Metric("pose features", found.features.lift.kind),
-        Metric("height of the template", float(np.ptp(found.template.vertices, axis=0).max()), "m"),
-        Metric("parts", ", ".join(found.skeleton.names))], judgement=Judgement())
+        Metric("vertices", len(imported.template.vertices)), Metric("triangles", len(imported.template.faces)),
+        Metric("joints", len(imported.skeleton.parents)), Metric("betas", imported.n_betas),
+        Metric("pose columns", len(imported.correctives)), Metric("pose features", imported.features.lift.kind),
+        Metric("height of the template", float(np.ptp(imported.template.vertices, axis=0).max()), "m"),
+        Metric("parts", ", ".join(imported.skeleton.names))], judgement=Judgement())
 
 
 def read_body(path: Path, template: Mesh, unit: Unit | None = None) -> Mesh:
-    """A mesh in the triangles of a model's template; ValueError for one of others."""
+    """Read a mesh in the triangles of a model's template; ValueError for a mesh with other triangles."""
     body = read_mesh(path, unit)
     if not np.array_equal(body.faces, template.faces):
         raise ValueError(f"{path}: expected the triangles of the model ({template}), found {body}; register the "
@@ -112,13 +112,16 @@ def read_body(path: Path, template: Mesh, unit: Unit | None = None) -> Mesh:
 
 def read_bodies(folder: Path, template: Mesh, unit: Unit | None = None, one_person: bool = False
                 ) -> tuple[np.ndarray, tuple[str, ...]]:
-    """Vertices (n, N, 3) and names of a folder or a set: one body of every person, or all of the one with the most.
+    """Read vertices (n, N, 3) and names from a folder or a registered set.
+
+    Of a set, the first body of every person, or with `one_person` all bodies of the person with the most.
 
     Raises
     ------
     ValueError
         Triangles that are not those of the template.
     """
+    # a registered set says whose body each mesh is; a plain folder does not
     if (folder / "set.json").exists():
         whole = RegisteredSet.load(folder)
         faces, subjects = whole.template.faces, [entry.subject for entry in whole.entries]

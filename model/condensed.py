@@ -1,14 +1,14 @@
-"""A whole SCAPE body, part by part: the stitching system condensed onto the borders of the parts.
+"""The fast path of a whole SCAPE body: the stitching system condensed onto the borders of the parts.
 
 Inside a part, triangles follow few rotations and few features. So the stitched inside is a small table, once the
-vertices on the part's border are known. With Eq. 2's normal matrix L = GᵀG, insides i of the parts and border b:
+vertices on the part's border are known. With Eq. 2's normal matrix L = GᵀG, inner vertices i and border vertices b:
 
     y_i = U_p + H_p y_b          U_p = L_ii⁻¹ G_iᵀ e_p,    H_p = -L_ii⁻¹ L_ib
     y_b = A Σ_p (G_b + G_i H_p)ᵀ e_p                       A = S⁻¹ of the Schur complement S = L_bb + Σ_p L_bi H_p
 
-The edges e_p, so U_p and the loads on the border too, are linear in betas and in products of features and rotations.
+The edges e_p are linear in betas and in products of features and rotations; so are U_p and the loads on the border.
 A body with new betas is one product of betas and tables: no system is solved again. A pose reads a third of the numbers
-that the products of all vertices hold (`Products`), which say the same.
+that the equivalent products of all vertices hold (`Products`).
 
 [SCAPE] Eq. 2, Eq. 9
 """
@@ -29,15 +29,16 @@ from .linear import PointOperator, find_single_rows
 from .products import Products, ShapedProducts, Terms
 from .stitching import edge_operator
 
-AT_ONCE = 96                         # coordinates that are made together: more leave the cache, fewer waste products
-MANY = 10                            # one vertex in so many: all products are made, 77 ms of 12,500, then some in 4 ms
+AT_ONCE = 96                         # coordinates made together: more would leave the cache, fewer waste the products
+MANY = 10                            # beyond a tenth of the vertices all products are made (77 ms for 12,500), not some
 
 
 @dataclass(frozen=True, eq=False)
 class PartSystem:
-    """The triangles (f,) of one part, the vertices inside it (i,), and the `places` (b,) of its border among all.
+    """The stitching system of one part, with its border held.
 
-    `loads` are the same places, and of part 0 that of the root's joint after all others. `spread` is H (i, b);
+    `faces` (f,) are its triangles, `inside` (i,) its inner vertices, `places` (b,) its border among all border
+    vertices. `loads` are the same places; part 0 has one more, for the root's joint. `spread` is H (i, b).
     `edge_operator` (2f, i + b) gives the edges of the triangles.
     """
 
@@ -51,7 +52,7 @@ class PartSystem:
     factored: Factored | None
 
     def table(self, edges: np.ndarray) -> np.ndarray:
-        """(i + loads, k): U and the loads that wanted edges (2f, k) leave."""
+        """Solve for the inside and the loads on the border, (i + loads, k), that wanted edges (2f, k) bring about."""
         load, i = self.edge_operator.T @ edges, len(self.inside)
         U = load[:0] if self.factored is None else self.factored.solve(load[:i])
         rows = [U, load[i:] + self.spread.T @ load[:i]]
@@ -62,14 +63,14 @@ class PartSystem:
 
 @dataclass(eq=False)
 class Condensation:
-    """The stitching system of a triangulation, condensed once onto the n vertices `border` where parts meet.
+    """The stitching system of a triangulation, condensed once onto the n `border` vertices where parts meet.
 
     Parameters
     ----------
     faces : (F, 3) int
     part_of_face : (F,) int
     root_weights : (N,) float
-        Of the vertices whose mean is the root's joint.
+        Weights of the vertices whose mean is the root's joint.
     """
 
     faces: np.ndarray
@@ -78,6 +79,7 @@ class Condensation:
 
     def __post_init__(self) -> None:
         self.n_vertices, J = len(self.root_weights), self.part_of_face.max() + 1
+        # border vertices belong to triangles of more than one part
         touches = np.zeros((self.n_vertices, J), dtype=bool)
         touches[self.faces, self.part_of_face[:, None]] = True
         on_border = touches.sum(axis=1) > 1
@@ -101,12 +103,12 @@ class Condensation:
             loads = np.r_[places, n] if p == 0 else places
             self.parts.append(PartSystem(faces, inside, places, loads, spread, own, root[inside], factored))
 
-        # loads sum to zero: one more entry fixes where the border stands and changes nothing else
+        # edges do not fix the place; loads sum to zero, so one more entry fixes it and changes nothing else
         S[0, 0] += 1
         self.factored, self.follow = Factored(csc_array(S)), follow
         self._spreads: dict[Any, list[np.ndarray]] = {}
 
-        # vertices in the order of the insides, one part after the other, then the border; and where each is in it
+        # vertices are worked on in the order of the parts' insides, then the border; `place_of` finds each there
         self.inside = slices([len(part.inside) for part in self.parts])
         order = np.concatenate([*[part.inside for part in self.parts], self.border])
         self.place_of = np.argsort(order)
@@ -117,28 +119,31 @@ class Condensation:
         self.places_of = slices([len(part.places) for part in self.parts])
 
     def __reduce__(self) -> tuple[type[Condensation], tuple[np.ndarray, ...]]:
-        return Condensation, (self.faces, self.part_of_face, self.root_weights)      # made again where it is read
+        return Condensation, (self.faces, self.part_of_face, self.root_weights)      # factors are made anew on reading
 
     @cached_property
     def answer(self) -> np.ndarray:
-        """A (n, n + 1): the border that loads bring about, the root's joint in the origin; the last load is its own."""
+        """A (n, n + 1): the border positions by the loads; the last load is that of the root's joint.
+
+        The root's joint is in the origin.
+        """
         A = self.factored.solve(np.eye(len(self.border)) - self.follow[:, None]).T
         return np.concatenate([A, -np.ones((len(A), 1))], axis=1)
 
     def reach(self, ids: np.ndarray) -> np.ndarray:
-        """(n + 1, L) metres: what a unit load on each border vertex, and the last one, does to some vertices (L,)."""
+        """Compute the shift (n + 1, L) of vertices (L,) by a unit load on each border vertex and the root's joint."""
         place, answer = self.place_of[ids], self.answer.T
         out = np.empty((len(answer), len(ids)))
         of_border = place - (self.n_vertices - len(self.border))          # negative for vertices inside a part
         out[:, of_border >= 0] = answer[:, of_border[of_border >= 0]]
         for part, inside in zip(self.parts, self.inside, strict=True):
-            mine = np.flatnonzero((place >= inside.start) & (place < inside.stop))
-            if len(mine):
-                out[:, mine] = answer[:, part.places] @ part.spread[place[mine] - inside.start].T
+            inner = np.flatnonzero((place >= inside.start) & (place < inside.stop))
+            if len(inner):
+                out[:, inner] = answer[:, part.places] @ part.spread[place[inner] - inside.start].T
         return out
 
     def spreads(self, dtype: Any) -> list[np.ndarray]:
-        """Hᵀ (b, i) of every part, contiguous, in a type."""
+        """Return Hᵀ (b, i) of every part, contiguous, in a number type."""
         if dtype not in self._spreads:
             self._spreads[dtype] = [np.ascontiguousarray(part.spread.T, dtype=dtype) for part in self.parts]
         return self._spreads[dtype]
@@ -146,7 +151,7 @@ class Condensation:
 
 @dataclass(frozen=True, eq=False)
 class Condensed(PointOperator):
-    """All vertices of a body of fixed shape.
+    """The fast path of all vertices of a body of fixed shape.
 
     Parameters
     ----------
@@ -156,6 +161,7 @@ class Condensed(PointOperator):
     tables : J arrays (M_p, 3, i_p + loads_p), metres
         What each product of a part contributes to the vertices inside it and to the loads on its border.
     origin : (3,) float, metres
+        The root's joint when trans is zero.
     """
 
     system: Condensation
@@ -179,17 +185,18 @@ class Condensed(PointOperator):
         dtype = self.tables[0].dtype
         W = np.moveaxis(self.terms.weights(pose).astype(dtype, copy=False), -3, -2)        # (..., i, m, j)
         W = W.reshape(-1, self.terms.count, 3)
+        # a few coordinates at a time: products of a part times its table, then the parts are joined
         y = np.empty((len(W), self.count), dtype=dtype)
         for start in range(0, len(W), AT_ONCE):
-            some = W[start:start + AT_ONCE]
+            batch = W[start:start + AT_ONCE]
             y[start:start + AT_ONCE] = assemble_vertices(self.system, [
-                multiply_rows(some[:, mine].reshape(len(some), -1), table.reshape(-1, table.shape[2]))
-                for mine, table in zip(self.products_of_part, self.tables, strict=True)])
+                multiply_rows(batch[:, products].reshape(len(batch), -1), table.reshape(-1, table.shape[2]))
+                for products, table in zip(self.products_of_part, self.tables, strict=True)])
         return y.reshape(*pose.shape[:-2], 3, self.count)
 
     @cached_property
     def products_of_part(self) -> list[slice]:
-        """Which products the tables are of."""
+        """The products of each part, by number among all."""
         return slices([len(table) for table in self.tables])
 
     def columns(self, pose: np.ndarray, trans: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -197,38 +204,39 @@ class Condensed(PointOperator):
 
     @cached_property
     def products(self) -> Products:
-        """The same body as products of all vertices: what derivatives by the pose are made of."""
+        """The same body as products of all vertices; derivatives by the pose need these."""
         return self.of_vertices(np.arange(self.count))
 
     def of_vertices(self, ids: np.ndarray) -> Products:
-        """Some vertices (L,) as products."""
+        """Build the fast path of some vertices (L,) as products."""
         system, tables = self.system, [table.reshape(-1, table.shape[2]) for table in self.tables]
         dtype, rows = tables[0].dtype, slices([len(table) for table in tables])
         # where the vertices stand among insides and border
         place, n = system.place_of[ids], len(system.border)
         of_border = place - (system.n_vertices - n)                       # negative for vertices inside a part
-        of_part = [np.flatnonzero((place >= some.start) & (place < some.stop)) for some in system.inside]
+        of_part = [np.flatnonzero((place >= run.start) & (place < run.stop)) for run in system.inside]
 
+        # vertices on the border first; those inside follow it by H, and have the table of their own part
         around = self._around
         T = np.empty((rows[-1].stop, len(ids)), dtype=dtype)
         T[:, of_border >= 0] = around[:, of_border[of_border >= 0]]
-        for p, (some, chosen) in enumerate(zip(rows, of_part, strict=True)):
+        for p, (run, chosen) in enumerate(zip(rows, of_part, strict=True)):
             if len(chosen):
                 at = place[chosen] - system.inside[p].start
                 T[:, chosen] = around[:, system.parts[p].places] @ system.spreads(dtype)[p][:, at]
-                T[some, chosen] += tables[p][:, at]
+                T[run, chosen] += tables[p][:, at]
         return Products(self.terms, T.reshape(self.terms.count, 3, len(ids)), self.origin)
 
     @cached_property
     def _around(self) -> np.ndarray:
-        """(3M, n) what every product does to the border vertices."""
+        """(3M, n) the border positions that every product brings about."""
         answer = self.system.answer.T.astype(self.tables[0].dtype, copy=False)
         return np.concatenate([table.reshape(-1, table.shape[2])[:, len(part.inside):] @ answer[part.loads]
                                for part, table in zip(self.system.parts, self.tables, strict=True)])
 
     def combine(self, weights: np.ndarray | sparray) -> Products:
         used, mixed = find_needed_vertices(weights)
-        # more than a tenth of the vertices are asked for again and again, as a fit matches others in every round
+        # a fit matches other vertices in every round: beyond a tenth of them, products of all are made and kept
         if "products" in self.__dict__ or len(used) * MANY > self.count:
             return self.products.combine(weights)
         some = self.of_vertices(used)
@@ -247,7 +255,10 @@ class Condensed(PointOperator):
 
 
 def find_needed_vertices(weights: np.ndarray | sparray) -> tuple[np.ndarray, csr_array | None]:
-    """The vertices (n,) that combinations (L, N) need, and their weights (L, n); no weights where each is a vertex."""
+    """Find the vertices (n,) that combinations (L, N) need, and the weights (L, n) of these.
+
+    The weights are None where each combination is a single vertex.
+    """
     rows = find_single_rows(weights)
     if rows is not None:
         return np.asarray(rows), None
@@ -257,17 +268,19 @@ def find_needed_vertices(weights: np.ndarray | sparray) -> tuple[np.ndarray, csr
 
 
 def assemble_vertices(system: Condensation, local: list[np.ndarray]) -> np.ndarray:
-    """All vertices (k, N) of insides and loads (k, i_p + loads_p) of the parts, k coordinates at once.
+    """Join the parts: all vertices (k, N) from insides and loads (k, i_p + loads_p), k coordinates at once.
 
     [SCAPE] Eq. 2
     """
     k, dtype, n = len(local[0]), local[0].dtype, len(system.border)
+    # border: sum the loads of all parts, solve the Schur complement, and put the root's joint in the origin
     left = np.concatenate([rows[:, some.stop - some.start:] for rows, some in zip(local, system.inside, strict=True)],
                           axis=1)
     loads = system.scatter @ left.T
     around = system.factored.solve(loads[:n]).T
     around = np.ascontiguousarray(around - (around @ system.follow + loads[n])[:, None], dtype=dtype)
 
+    # insides: y_i = U_p + H_p y_b
     y, by_part = np.empty((k, system.n_vertices), dtype=dtype), around[:, system.all_places]
     y[:, -n:] = around
     for some, places, spread, rows in zip(system.inside, system.places_of, system.spreads(dtype), local, strict=True):
@@ -276,21 +289,21 @@ def assemble_vertices(system: Condensation, local: list[np.ndarray]) -> np.ndarr
 
 
 def multiply_rows(rows: np.ndarray, matrix: np.ndarray) -> np.ndarray:
-    """`rows @ matrix`; of few rows one by one, which BLAS does in two thirds of the time."""
+    """Multiply `rows @ matrix`; up to three rows go one by one, which BLAS does in two thirds of the time."""
     return (rows[:, None] @ matrix)[:, 0] if len(rows) <= 3 else rows @ matrix
 
 
 def slices(lengths: list[int]) -> list[slice]:
-    """Where parts of these lengths stand one after the other."""
+    """Return the slices of parts with these lengths that stand one after the other."""
     ends = np.cumsum(lengths).tolist()
     return [slice(end - length, end) for end, length in zip(ends, lengths, strict=True)]
 
 
 @dataclass(frozen=True, eq=False)
 class ShapedCondensed(ShapedPoints):
-    """All vertices of a body of free shape: tables of the template's own body, of the mean person, and by each beta.
+    """All vertices of a body with unknown betas: tables of the template's own body, the mean person, and each beta.
 
-    `flat` (K, n) are the changes of all tables by each beta, one after the other, as `mean` holds them.
+    `flat` (K, n) holds the change of all tables by each beta, table after table in the order of `mean.tables`.
     """
 
     own: Condensed
@@ -318,22 +331,26 @@ class ShapedCondensed(ShapedPoints):
             return self.own
         betas = self._check_betas(betas)
         flat = betas @ self.flat[:len(betas)]
-        tables = tuple(mean + flat[some].reshape(mean.shape) for some, mean in
+        tables = tuple(mean + flat[chosen].reshape(mean.shape) for chosen, mean in
                        zip(self._slices, self.mean.tables, strict=True))
         return replace(self.mean, tables=tables)
 
     def bodies(self, poses: np.ndarray, betas: np.ndarray) -> np.ndarray:
-        """Vertices (B, N, 3), metres, of poses (B, J, 3) and betas (B, k), the template's root joint in the origin."""
+        """Compute the vertices (B, N, 3), metres, of poses (B, J, 3) and betas (B, k), each body with its own.
+
+        The template's root joint is in the origin.
+        """
         mean, W = self.mean, np.moveaxis(self.mean.terms.weights(poses), -3, -2)                # (B, i, m, j)
         out = np.empty((len(poses), self.count, 3))
         for start in range(0, len(poses), AT_ONCE // 3):
-            some = slice(start, start + AT_ONCE // 3)
-            flat, local = betas[some] @ self.flat[:betas.shape[1]], []
-            for mine, chosen, table in zip(mean.products_of_part, self._slices, mean.tables, strict=True):
+            # tables of every person, times the products of the person's pose, part by part
+            batch = slice(start, start + AT_ONCE // 3)
+            flat, local = betas[batch] @ self.flat[:betas.shape[1]], []
+            for products, chosen, table in zip(mean.products_of_part, self._slices, mean.tables, strict=True):
                 tables = (flat[:, chosen] + table.ravel()).reshape(len(flat), -1, table.shape[2])
-                rows = W[some][:, :, mine].reshape(len(flat), 3, -1) @ tables
+                rows = W[batch][:, :, products].reshape(len(flat), 3, -1) @ tables
                 local.append(rows.reshape(-1, table.shape[2]))
-            out[some] = np.swapaxes(assemble_vertices(mean.system, local).reshape(len(flat), 3, -1), 1, 2)
+            out[batch] = np.swapaxes(assemble_vertices(mean.system, local).reshape(len(flat), 3, -1), 1, 2)
         return out
 
     @cached_property
@@ -344,10 +361,11 @@ class ShapedCondensed(ShapedPoints):
         pose = np.asarray(pose, dtype=np.float64)
         K, terms = self.n_betas, self.mean.terms
         W = np.moveaxis(terms.weights(pose), -3, -2).reshape(-1, terms.count, 3)
+        # the same products as for a body, times the change of the tables by each beta
         local = []
-        for some, flat, table in zip(self.mean.products_of_part, self._slices, self.mean.tables, strict=True):
+        for products, flat, table in zip(self.mean.products_of_part, self._slices, self.mean.tables, strict=True):
             change = self.flat[:, flat].reshape(K, -1, table.shape[2])
-            rows = W[:, some].reshape(len(W), 1, 1, -1) @ change                            # (B 3, K, 1, rows)
+            rows = W[:, products].reshape(len(W), 1, 1, -1) @ change                            # (B 3, K, 1, rows)
             local.append(rows.reshape(-1, table.shape[2]))
         y = assemble_vertices(self.mean.system, local).reshape(*pose.shape[:-2], 3, K, self.count)
         return np.moveaxis(y, -1, -3)
@@ -356,15 +374,15 @@ class ShapedCondensed(ShapedPoints):
         used, mixed = find_needed_vertices(weights)
         system, L, basis = self.mean.system, len(used), []
         reach, place = system.reach(used), system.place_of[used]
-        # of every part the tables of the two bodies and of all betas, as rows of one product
-        for part, inside, some, own, mean in zip(system.parts, system.inside, self._slices, self.own.tables,
+        # of every part, the tables of both bodies and of all betas are rows of one product: border, then inside
+        for part, inside, chosen, own, mean in zip(system.parts, system.inside, self._slices, self.own.tables,
                                                  self.mean.tables, strict=True):
-            rows = np.concatenate([own.reshape(1, -1), mean.reshape(1, -1), self.flat[:, some]])
+            rows = np.concatenate([own.reshape(1, -1), mean.reshape(1, -1), self.flat[:, chosen]])
             rows = rows.reshape(-1, mean.shape[2])
-            found = rows[:, len(part.inside):] @ reach[part.loads]
-            mine = np.flatnonzero((place >= inside.start) & (place < inside.stop))
-            found[:, mine] += rows[:, place[mine] - inside.start]
-            basis.append(found.reshape(2 + self.n_betas, len(mean), 3, L))
+            moved = rows[:, len(part.inside):] @ reach[part.loads]
+            inner = np.flatnonzero((place >= inside.start) & (place < inside.stop))
+            moved[:, inner] += rows[:, place[inner] - inside.start]
+            basis.append(moved.reshape(2 + self.n_betas, len(mean), 3, L))
         T = np.concatenate(basis, axis=1)
         points = ShapedProducts(self.mean.terms, T[0], T[1], T[2:], self.mean.origin)
         return points if mixed is None else points.combine(mixed)

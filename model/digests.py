@@ -1,4 +1,4 @@
-"""Bodies in the topology of a template: whether they are, and digests by which a model knows its own."""
+"""Checks of bodies against a template's topology, and digests by which a model recognises its training bodies."""
 from __future__ import annotations
 
 import hashlib
@@ -11,13 +11,13 @@ from .body import BodyModel
 
 
 def body_digest(vertices: np.ndarray) -> str:
-    """A short digest of one registered body (N, 3), the same for float64 and float32."""
-    # hexadecimal digits, 64 bits: chance meetings are rare below a billion bodies
+    """Compute a short digest of one registered body (N, 3), the same for float64 and float32."""
+    # 16 hexadecimal digits are 64 bits: two of a billion bodies rarely share them by chance
     return hashlib.sha256(np.ascontiguousarray(vertices, dtype=np.float32).tobytes()).hexdigest()[:16]
 
 
 def digest(template: Mesh, poses: np.ndarray, shapes: np.ndarray | None) -> str:
-    """SHA-256 of a whole training set: `info["digest"]` of a model."""
+    """Compute the SHA-256 of a whole training set: `info["digest"]` of a model."""
     total = hashlib.sha256()
     for array in (template.vertices, template.faces, poses, shapes):
         if array is not None:
@@ -26,12 +26,12 @@ def digest(template: Mesh, poses: np.ndarray, shapes: np.ndarray | None) -> str:
 
 
 def body_digests(*sets: np.ndarray | None) -> list[str]:
-    """The digest of every body of some training sets (M, N, 3): `info["digests"]` of a model."""
+    """Compute the digest of every body in training sets (M, N, 3): `info["digests"]` of a model."""
     return [body_digest(body) for bodies in sets if bodies is not None for body in bodies]
 
 
 def was_trained_on(model: BodyModel, bodies: np.ndarray) -> np.ndarray | None:
-    """(M,) bool: which of the bodies (M, N, 3) the model was trained on; None where its file does not say."""
+    """Find which of the bodies (M, N, 3) the model was trained on, (M,) bool; None where its file does not say."""
     known = model.info.get("digests")
     if known is None:
         return None
@@ -39,7 +39,7 @@ def was_trained_on(model: BodyModel, bodies: np.ndarray) -> np.ndarray | None:
 
 
 def check_bodies(template: Mesh, bodies: np.ndarray, name: str, least: int = 1) -> np.ndarray:
-    """At least so many finite bodies (n, N, 3) in the template's topology, or ValueError."""
+    """Check that bodies (n, N, 3) are finite, at least `least`, and in the template's topology, else ValueError."""
     bodies, N = np.asarray(bodies, dtype=np.float64), len(template.vertices)
     if bodies.ndim != 3 or bodies.shape[1:] != (N, 3):
         raise ValueError(f"{name}: expected shape (n, {N}, 3) like the template, got {bodies.shape}")

@@ -1,4 +1,4 @@
-"""What a pose model is linear in: functions of the joint twists, and their products with part rotations."""
+"""Pose features: the functions of the joint twists in which a pose model is linear."""
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
@@ -11,11 +11,11 @@ import numpy as np
 from scanprep.geometry import rotations, storage
 from scanprep.skeleton.tree import Skeleton
 
-_FIRST, _SECOND = np.triu_indices(3)
+_FIRST, _SECOND = np.triu_indices(3)        # the six pairs of entries of a twist, for products
 
 
 def twists(pose: np.ndarray) -> np.ndarray:
-    """The twists (..., J, 3), radians, at most π long, of poses (..., J, 3) of any length.
+    """Compute the twists (..., J, 3), radians, at most π long, of poses (..., J, 3) of any length.
 
     [SCAPE] §4.2
     """
@@ -25,9 +25,9 @@ def twists(pose: np.ndarray) -> np.ndarray:
 
 
 class Lift(Protocol):
-    """A fixed map of the twists of each joint to a few numbers a joint, in which a regression is linear.
+    """A fixed map from the twist of each joint to m numbers, in which the regression is linear.
 
-    Its kind names it in files; width is m, the numbers of each joint.
+    `kind` is its name in files; `width` is m.
     """
 
     kind: str
@@ -36,11 +36,11 @@ class Lift(Protocol):
     def width(self) -> int: ...
 
     def evaluate(self, t: np.ndarray) -> np.ndarray:
-        """Values (..., J, m) at twists (..., J, 3), radians."""
+        """Compute the values (..., J, m) at twists (..., J, 3), radians."""
         ...
 
     def derivative(self, t: np.ndarray) -> np.ndarray:
-        """Derivatives (..., J, m, 3) of the values of each joint by its own twist (..., J, 3)."""
+        """Compute the derivatives (..., J, m, 3) of the values of each joint by its own twist (..., J, 3)."""
         ...
 
 
@@ -78,19 +78,20 @@ class QuadraticLift:
 
     @staticmethod
     def of_directions(directions: np.ndarray) -> np.ndarray:
-        """(9, k + k (k + 1) / 2) mixtures of the numbers: twists along directions (3, k), and products of these."""
+        """Express twists along directions (3, k), and their products, in the nine numbers: (9, k + k (k + 1) / 2)."""
         pairs = [np.outer(directions[:, a], directions[:, b])
                  for a, b in zip(*np.triu_indices(directions.shape[1]), strict=True)]
         out = np.zeros((9, directions.shape[1] + len(pairs)))
         out[:3, :directions.shape[1]] = directions
         for column, pair in zip(out.T[directions.shape[1]:], pairs, strict=True):
+            # (a·t)(b·t) in the six products of the entries of t; squares stand once, mixed products twice
             column[3:] = np.where(_FIRST == _SECOND, 0.5, 1.0) * (pair + pair.T)[_FIRST, _SECOND]
         return out
 
 
 @dataclass(frozen=True)
 class RotationLift:
-    """The rotation less the identity, row by row.
+    """The rotation minus the identity, row by row.
 
     Loper et al., SMPL, 2015.
     """
@@ -102,13 +103,14 @@ class RotationLift:
         return (rotations.exp(t) - np.eye(3)).reshape(*t.shape[:-1], 9)
 
     def derivative(self, t: np.ndarray) -> np.ndarray:
-        along = rotations.hat(np.swapaxes(rotations.right_jacobian(t), -1, -2))                # of every parameter
+        # dR = R hat(J_r dt), for each of the three parameters
+        along = rotations.hat(np.swapaxes(rotations.right_jacobian(t), -1, -2))
         return np.moveaxis(rotations.exp(t)[..., None, :, :] @ along, -3, -1).reshape(*t.shape[:-1], 9, 3)
 
 
 @dataclass(frozen=True)
 class QuaternionLift:
-    """The unit quaternion (x, y, z, w) of the rotation, less that of none.
+    """The unit quaternion (x, y, z, w) of the rotation, minus that of the identity.
 
     Osman et al., STAR, 2020.
     """
@@ -133,17 +135,18 @@ LIFTS: dict[str, Lift] = {lift.kind: lift for lift in (LinearLift(), QuadraticLi
 
 
 def lift_twists(lift: Lift, pose: np.ndarray) -> np.ndarray:
-    """The lifted twists (..., J, m) of poses (..., J, 3) of any length."""
+    """Compute the lifted twists (..., J, m) of poses (..., J, 3) of any length."""
     return lift.evaluate(twists(pose))
 
 
 def lift_derivative(lift: Lift, pose: np.ndarray) -> np.ndarray:
-    """(..., J, m, 3) derivative of the lifted twists of each joint by its pose parameters (..., J, 3)."""
+    """Compute the derivative (..., J, m, 3) of the lifted twists by the joints' pose parameters (..., J, 3)."""
     pose = np.asarray(pose, dtype=np.float64)
     t = twists(pose)
     slope = lift.derivative(t)
     far = np.linalg.norm(pose, axis=-1) > np.pi
     if far.any():
+        # beyond half a turn the twist is another vector with the same rotation: chain rule between the two
         turn = rotations.inverse_right_jacobian(t[far]) @ rotations.right_jacobian(pose[far])
         slope = slope.copy()
         slope[far] = slope[far] @ turn
@@ -151,9 +154,9 @@ def lift_derivative(lift: Lift, pose: np.ndarray) -> np.ndarray:
 
 
 def restore_features(skeleton: Skeleton, header: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> PoseFeatures:
-    """The features of a model file, or ValueError."""
+    """Read the features of a model file; ValueError where they do not fit."""
     J = len(skeleton.parents)
-    if "direction_count" in arrays:             # of the first version, which had linear ones only
+    if "direction_count" in arrays:             # files of version 1 have linear features only
         kept = storage.numbers(arrays, "direction_count", J)
         directions = storage.numbers(arrays, "directions", int(kept.sum()), 3)
         return linear_features(skeleton, tuple(np.split(directions.T, np.cumsum(kept)[:-1], axis=1)))
@@ -167,10 +170,10 @@ def restore_features(skeleton: Skeleton, header: Mapping[str, Any], arrays: Mapp
 
 @dataclass(frozen=True, eq=False)
 class PoseFeatures:
-    """What Q is linear in: for every part a constant, and mixtures of the lifted twists of its joints.
+    """The features in which Q is linear: for every part a constant, and mixtures of the lifted twists of its joints.
 
-    `part` (A,) is the part of every feature, rising, the first of each its constant; `mix` (J, m, A) is how much each
-    lifted number counts in each feature, zero for the constants.
+    `part` (A,) is the part of every feature, in rising order; the first feature of a part is its constant. `mix`
+    (J, m, A) is the weight of each lifted number in each feature, zero for the constants.
 
     [SCAPE] Eq. 3
     """
@@ -212,30 +215,31 @@ class PoseFeatures:
         return self.mix.reshape(-1, self.count)
 
     def of_part(self, p: int) -> slice:
-        """The features of part p."""
+        """Return the features of part p, as a slice of all."""
         end = self.starts[p + 1] if p + 1 < len(self.starts) else self.count
         return slice(int(self.starts[p]), int(end))
 
     def evaluate(self, pose: np.ndarray) -> np.ndarray:
-        """Features (..., A) of poses (..., J, 3), radians."""
+        """Compute the features (..., A) of poses (..., J, 3), radians."""
         raised = lift_twists(self.lift, pose)
         return raised.reshape(*raised.shape[:-2], len(self._flat)) @ self._flat + self.constant
 
     def derivative(self, pose: np.ndarray) -> np.ndarray:
-        """(..., A, J, 3) derivative of every feature by the pose parameters (..., J, 3)."""
+        """Compute the derivative (..., A, J, 3) of every feature by the pose parameters (..., J, 3)."""
         by_joint = np.swapaxes(self.mix, -1, -2) @ lift_derivative(self.lift, pose)              # (..., J, A, 3)
         return np.swapaxes(by_joint, -2, -3)
 
 
 def part_features(skeleton: Skeleton, lift: Lift, axes: Sequence[np.ndarray],
                   joints_of_part: Sequence[Sequence[int]] | None = None) -> PoseFeatures:
-    """For every part a constant, and the mixtures `axes` (J arrays (m, k_j)) of the lifted twists of its joints.
+    """Build features: for every part a constant, and mixtures `axes` (J arrays (m, k_j)) of its joints' lifted twists.
 
     [SCAPE] Eq. 3
     """
     J = len(skeleton.parents)
     part, columns = [], []
     for p, joints in enumerate(skeleton.joints_of_part if joints_of_part is None else joints_of_part):
+        # the constant of the part, then the mixtures of each of its joints
         part += [p] * (1 + sum(axes[j].shape[1] for j in joints))
         columns.append(np.zeros((J, lift.width, 1)))
         for j in joints:
@@ -246,7 +250,7 @@ def part_features(skeleton: Skeleton, lift: Lift, axes: Sequence[np.ndarray],
 
 
 def linear_features(skeleton: Skeleton, directions: Sequence[np.ndarray]) -> PoseFeatures:
-    """The features of the paper: for every part a constant and the twist directions (3, k_j) of its joints.
+    """Build the features of the paper: for every part a constant and the twist directions (3, k_j) of its joints.
 
     [SCAPE] Eq. 3
     """

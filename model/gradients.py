@@ -10,11 +10,11 @@ from scipy.sparse import coo_array, csc_array
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.sparse import Factored
 
-PULL = 1e-4                          # pull towards I, as a share of w_s: decides what nothing else decides
+PULL = 1e-4                          # pull towards I, as a share of w_s: only decides what the edges leave open
 
 
 def edges(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """The two edges (..., F, 2, 3) of every triangle from its first vertex.
+    """Compute the two edges (..., F, 2, 3) of every triangle from its first vertex.
 
     [SCAPE] Eq. 1
     """
@@ -26,8 +26,8 @@ def edges(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
 class GradientSystem:
     """The least-squares systems of Eq. 5 and Eq. 8 over the triangles of one template.
 
-    One row of a gradient is three unknowns a triangle; the three rows share the matrix. With `parts` (F,), neighbours
-    in different parts are not smoothed over. The smoothness times the mean edge length in metres is w_s.
+    Each row of a gradient has three unknowns a triangle, and the three rows share one matrix. With `parts` (F,),
+    neighbours in different parts are not smoothed. w_s is the smoothness times the mean edge length in metres.
 
     [SCAPE] Eq. 5
     """
@@ -38,12 +38,12 @@ class GradientSystem:
 
     @property
     def w_s(self) -> float:
-        """The weight of the smoothness, in square metres as the data term counts it."""
+        """Weight of the smoothness, in square metres like the data term."""
         return self.smoothness * self.template.mean_edge
 
     @cached_property
     def laplacian(self) -> csc_array:
-        """(F, F) graph Laplacian of the smoothed pairs, times w_s, with the pull towards I on its diagonal."""
+        """(F, F) graph Laplacian of neighbouring triangles, times w_s, with the pull towards I on its diagonal."""
         pairs = self.template.face_pairs
         if self.parts is not None:
             pairs = pairs[self.parts[pairs[:, 0]] == self.parts[pairs[:, 1]]]
@@ -55,12 +55,14 @@ class GradientSystem:
         return csc_array(off + diagonal) * self.w_s
 
     def matrix(self, blocks: np.ndarray) -> csc_array:
-        """(3F, 3F) normal matrix for the data blocks `Σ_j e_j e_jᵀ` (F, 3, 3) of the edges acted upon."""
+        """Assemble the normal matrix (3F, 3F) for data blocks `Σ_j e_j e_jᵀ` (F, 3, 3) of the edges before Q or S."""
         F = len(blocks)
         k = np.arange(F)
+        # data: one dense 3×3 block for every triangle on the diagonal
         row = (3 * k[:, None, None] + np.arange(3)[:, None]) + np.zeros((1, 1, 3), int)
         column = (3 * k[:, None, None] + np.arange(3)[None, :]) + np.zeros((1, 3, 1), int)
         smooth = coo_array(self.laplacian)
+        # smoothness: the Laplacian couples equal columns c of neighbouring gradients
         r = [row.ravel()] + [3 * smooth.row + c for c in range(3)]
         s = [column.ravel()] + [3 * smooth.col + c for c in range(3)]
         v = [blocks.ravel()] + [smooth.data] * 3
@@ -69,23 +71,24 @@ class GradientSystem:
 
     @cached_property
     def of_template(self) -> Factored:
-        """The system of Eq. 5: the edges acted upon are those of the template, for every pose."""
+        """The factored system of Eq. 5; it serves every pose, since Q acts on the template's edges."""
         v_hat = edges(self.template.vertices, self.template.faces)
         return Factored(self.matrix(np.swapaxes(v_hat, -1, -2) @ v_hat))
 
     def right_side(self, before: np.ndarray, after: np.ndarray) -> np.ndarray:
-        """(..., F, 3, 3) of `Σ_j e_j v_jᵀ`, for edges (..., F, 2, 3) before and after, and the pull towards I."""
+        """Compute the right side `Σ_j e_j v_jᵀ` (..., F, 3, 3) of edges (..., F, 2, 3) before, after, and the pull."""
         return np.swapaxes(before, -1, -2) @ after + PULL * self.w_s * np.eye(3)
 
 
 def pose_gradients(system: GradientSystem, local: np.ndarray) -> np.ndarray:
-    """Q (M, F, 3, 3) of every triangle from edges (M, F, 2, 3) in the frames of the parts; the system is factored once.
+    """Fit Q (M, F, 3, 3) of every triangle to edges (M, F, 2, 3) in the frames of the parts, metres.
 
     [SCAPE] Eq. 5
     """
     v_hat = edges(system.template.vertices, system.template.faces)
     M, F = local.shape[:2]
     Q = np.empty((M, F, 3, 3))
+    # as many instances as the solver takes columns, three columns each
     step = Factored.LIMIT // 3
     for start in range(0, M, step):
         rhs = system.right_side(v_hat, local[start:start + step])        # (m, F, column, row)
@@ -95,10 +98,10 @@ def pose_gradients(system: GradientSystem, local: np.ndarray) -> np.ndarray:
 
 
 def shape_gradients(system: GradientSystem, posed: np.ndarray, local: np.ndarray) -> np.ndarray:
-    """S (F, 3, 3) of one person from edges `local` in the frames of the parts and `posed`, `Q v̂`, both (F, 2, 3),
-    metres.
+    """Fit S (F, 3, 3) of one person to edges.
 
-    Or (F, 2n, 3) for n scans of one person together.
+    `local` (F, 2, 3) are the edges in the frames of the parts, `posed` (F, 2, 3) the edges `Q v̂`, metres. For n scans
+    of one person together both are (F, 2n, 3).
 
     [SCAPE] Eq. 8
     """
@@ -121,6 +124,6 @@ class ShapeSolver:
         self._factored = Factored(system.matrix(np.swapaxes(posed, -1, -2) @ posed))
 
     def __call__(self, local: np.ndarray) -> np.ndarray:
-        """S (F, 3, 3) for edges `local`, as for `shape_gradients`."""
+        """Fit S (F, 3, 3) to edges `local`, as for `shape_gradients`."""
         x = self._factored.solve(self.system.right_side(self.posed, local).reshape(-1, 3))
         return np.swapaxes(x.reshape(-1, 3, 3), -1, -2)

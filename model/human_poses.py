@@ -1,7 +1,7 @@
-"""Poses that people take, for the skeleton of any person: what is known of joints before a pose of this one is seen.
+"""Poses that people take, for the skeleton of any person: prior knowledge for bodies with few training poses.
 
-They are drawn as those of the synthetic people (named everyday poses, limb by limb, loosened), and carried to another
-skeleton by the directions of its bones. No scan was used.
+They are drawn as for the synthetic people (everyday poses, mixed limb by limb, with noise). The directions of the bones
+carry them to another skeleton. No scan was used.
 """
 from __future__ import annotations
 
@@ -18,38 +18,42 @@ Moments = tuple[np.ndarray, np.ndarray]         # mean (J, 3) and covariance (3J
 
 TRUNK = ("pelvis", "abdomen", "chest", "head")
 LIMBS = {"arm": ("upper_arm", "forearm", "hand"), "leg": ("thigh", "shin", "foot")}
-WORTH = 8                            # training poses that what people do with their joints counts as
+WORTH = 8                            # the poses of all people count as much as so many training poses
 
 
 def human_poses(template: Mesh, skeleton: Skeleton, count: int, rng: np.random.Generator) -> np.ndarray | None:
-    """Poses (count, J, 3), radians, the root at rest, of a template that stands; None for a body that is no person.
+    """Draw poses (count, J, 3), radians, for a template that stands; None for a body that is no person.
 
-    A body counts as a person by the names of its parts, see `name_parts`.
+    The root is at rest. A body counts as a person by the names of its parts, see `name_parts`.
     """
     names, chains = skeleton.names, _limbs(skeleton)
     if not all(chains.values()):
         return None
     # axes (3, 3) take directions of the synthetic people, whose left is +x and who face -y, to the template's
     joint = {key: skeleton.joints[chain[0]] for key, chain in chains.items()}
+    # up from hips to shoulders, left from the right limbs to the left ones
     hips, shoulders = (np.mean([joint[kind, side] for side in ("left", "right")], axis=0) for kind in ("leg", "arm"))
     up = _unit(shoulders - hips)
     left = joint["leg", "left"] - joint["leg", "right"] + joint["arm", "left"] - joint["arm", "right"]
     left = _unit(left - up * (left @ up))
     axes = np.stack([left, np.cross(up, left), up], axis=1)
     scale = float(np.ptp(template.vertices @ up)) / average().stature
-    # of every part: rotations of two of their parts, and how far from one to the other; what takes its bone to theirs
+    # for every part: two parts a, b of the synthetic people and a share, how far to interpolate from a to b;
+    # and the rotation that takes the bone at rest to that of the synthetic people
     plain = [name.rstrip("0123456789") for name in names]
     trunk = [{"neck": "head", "trunk": "abdomen"}.get(name, name if name in TRUNK else "pelvis") for name in plain]
     source = [(PARTS.index(part), PARTS.index(part), 0.0) for part in trunk]
     at_rest = np.tile(np.eye(3), (len(names), 1, 1))
     for (kind, side), chain in chains.items():
         _follow_limb(template, skeleton, chain, kind, side, scale, axes, source, at_rest)
+    # poses of the synthetic people: world rotations of their parts, in the template's axes
     drawn = np.stack([random_pose(rng) for _ in range(count)])
     drawn[:, 0] = 0
     R = rotations.exp(drawn)
     for part in range(1, len(PARENTS)):
         R[:, part] = R[:, PARENTS[part]] @ R[:, part]
     R = axes @ R @ axes.T
+    # rotations carried to this skeleton; toes, fingers and face stay at rest
     world = np.stack([R[:, a] if share == 0 else
                       R[:, a] @ rotations.exp(share * rotations.log(np.swapaxes(R[:, a], -1, -2) @ R[:, b]))
                       for a, b, share in source], axis=1)
@@ -59,42 +63,41 @@ def human_poses(template: Mesh, skeleton: Skeleton, count: int, rng: np.random.G
 
 
 def is_person(skeleton: Skeleton) -> bool:
-    """Whether the parts of a skeleton have the names of a person's, so that `human_poses` hold for it."""
+    """Return whether a skeleton's parts are named as a person's, so that `human_poses` applies."""
     return all(_limbs(skeleton).values())
 
 
 def _limbs(skeleton: Skeleton) -> dict[tuple[str, str], list[int]]:
-    """The parts of every limb from the trunk outwards, by kind and side; none where names do not tell."""
+    """Find the parts of every limb from the trunk outwards, by kind and side; none where no names match."""
     return {(kind, side): limb_parts(skeleton.names, skeleton.parents, skeleton.joints, kind, side)
             for kind in LIMBS for side in ("left", "right")}
 
 
 def is_held(name: str) -> bool:
-    """Whether a part, by its name, is one that poses of people here leave at rest: toes, fingers, face."""
-    # parts that stay at rest
+    """Return whether `human_poses` leaves a part, by its name, at rest: toes, fingers and face."""
     return part_kind(name) in ("toes", "fingers", "jaw", "eye", "index", "middle", "pinky", "ring", "thumb")
 
 
 def with_human_poses(template: Mesh, skeleton: Skeleton, count: int, mean: np.ndarray, covariance: np.ndarray
                      ) -> Moments:
-    """Mean (J, 3) and covariance (3J, 3J) of `count` training poses mixed with those of all people.
+    """Mix mean (J, 3) and covariance (3J, 3J) of `count` training poses with those of the poses of all people.
 
-    The fewer poses were seen, the more is taken from all people, of whom no joint is quite like this body's: of eight
-    poses one half, of eighty a tenth. Nothing changes for a body that is no person.
+    The share of all people is a half for eight training poses and about a tenth for eighty. Nothing changes for a body
+    that is no person.
     """
-    drawn = 400  # poses for its mean and covariance
+    drawn = 400  # poses from which mean and covariance of all people are computed
     people = human_poses(template, skeleton, drawn, np.random.default_rng(0))
     if people is None:
         return mean, covariance
-    # radians by which joints of this body may differ from those of all people
+    # 0.25 rad: joints of this body may differ so much from those of all people, standard deviation
     loose = np.full(mean.size, 0.25)
     loose[:3] = 0                                                                 # the root is at rest
-    theirs = people.mean(axis=0), np.cov(people.reshape(drawn, -1).T) + np.diag(loose**2)
-    return mix_moments((mean, covariance), theirs, count / (count + WORTH))
+    of_people = people.mean(axis=0), np.cov(people.reshape(drawn, -1).T) + np.diag(loose**2)
+    return mix_moments((mean, covariance), of_people, count / (count + WORTH))
 
 
 def mix_moments(one: Moments, other: Moments, share: float) -> Moments:
-    """Moments of poses of which a share has those of the one, and the rest those of the other."""
+    """Compute the moments of a mixture: a share of the poses has moments `one`, the rest has moments `other`."""
     apart = (one[0] - other[0]).ravel()
     return (share * one[0] + (1 - share) * other[0],
             share * one[1] + (1 - share) * other[1] + share * (1 - share) * np.outer(apart, apart))
@@ -102,33 +105,39 @@ def mix_moments(one: Moments, other: Moments, share: float) -> Moments:
 
 def _follow_limb(template: Mesh, skeleton: Skeleton, chain: list[int], kind: str, side: str, scale: float,
                  axes: np.ndarray, source: list[tuple[int, int, float]], at_rest: np.ndarray) -> None:
-    """Pair the parts of a limb with those of the synthetic people by their distance from its end."""
+    """Pair the parts of a limb with those of the synthetic people by their distance from the limb's end.
+
+    Fills `source` and `at_rest` of `human_poses` for the parts in `chain`.
+    """
     a, parts = average(), [PARTS.index(f"{part}_{side}") for part in LIMBS[kind]]
     far = scale * _from_the_end(np.vstack([a.joints[parts], a.ends[parts[-1]]]))  # (4,), 0 at the fingers or toes
+    # the tip of this limb: the point of the last part's skin farthest from its joint
     skin = template.vertices[np.unique(template.faces[skeleton.part_of_face == chain[-1]])]
     tip = skin[np.linalg.norm(skin - skeleton.joints[chain[-1]], axis=1).argmax()]
-    mine = np.vstack([skeleton.joints[chain], tip])
-    away = _from_the_end(mine)
+    points = np.vstack([skeleton.joints[chain], tip])
+    away = _from_the_end(points)
     middles = (away[1:] + away[:-1]) / 2
     segment = np.array([int((far[1:-1] > middle).sum()) for middle in middles])   # 0 upper arm, 1 forearm, 2 hand
+    # each part gets the rotations of its segment; a shoulder before the upper arm gets some of the upper arm's
     for i, part in enumerate(chain):
         k, same = segment[i], np.flatnonzero(segment == segment[i])
-        if k == 0 and len(same) > 1 and i == 0:                                   # a shoulder goes some of the way
-            # of an upper arm's rotation against the chest three tenths happen in the shoulder itself
+        if k == 0 and len(same) > 1 and i == 0:
+            # three tenths of the upper arm's rotation against the chest happen in the shoulder girdle
             source[part] = int(PARENTS[parts[0]]), parts[0], 0.3
             continue
         source[part] = parts[k], parts[k], 0.0
         if kind == "arm" or k < 2:
+            # the smallest rotation that takes our bone's direction at rest to theirs
             first = same[1] if k == 0 and len(same) > 1 else same[0]
-            theirs = axes @ _unit(a.ends[parts[k]] - a.joints[parts[k]])
-            own = _unit(mine[same[-1] + 1] - mine[first])
-            cross = np.cross(own, theirs)             # the least rotation from ours to theirs
+            target = axes @ _unit(a.ends[parts[k]] - a.joints[parts[k]])
+            own = _unit(points[same[-1] + 1] - points[first])
+            cross = np.cross(own, target)
             sine = float(np.linalg.norm(cross))
-            at_rest[part] = rotations.exp(cross / max(sine, 1e-12) * np.arctan2(sine, float(own @ theirs)))
+            at_rest[part] = rotations.exp(cross / max(sine, 1e-12) * np.arctan2(sine, float(own @ target)))
 
 
 def _from_the_end(places: np.ndarray) -> np.ndarray:
-    """(n,) the way from each of a chain of points (n, 3) to the last."""
+    """Compute the distance (n,) along a chain of points (n, 3) from each to the last."""
     steps = np.linalg.norm(np.diff(places, axis=0), axis=1)
     return np.r_[np.cumsum(steps[::-1])[::-1], 0.0]
 

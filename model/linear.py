@@ -1,7 +1,7 @@
 """The fast path: points of a fixed body as a function of its pose and place, with derivatives.
 
-What a kind of model makes of a pose is a `PointOperator`: SCAPE adds up products of features and rotations
-(`model.products`), skinning blends rotations at every vertex (`model.blended`).
+Each kind of model has its own `PointOperator`. SCAPE adds up products of features and rotations (`model.products`);
+skinning blends rotations at every vertex (`model.blended`).
 """
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from scanprep.skeleton.tree import Skeleton
 
 
 def check_pose(skeleton: Skeleton, pose: Any, trans: Any) -> tuple[np.ndarray, np.ndarray]:
-    """Pose (..., J, 3) and trans (..., 3), finite and with the same leading shape."""
+    """Check pose (..., J, 3) and trans (..., 3): finite, with the same leading shape; else ValueError."""
     pose = np.asarray(pose, dtype=np.float64)
     J = len(skeleton.parents)
     if pose.ndim not in (2, 3) or pose.shape[-2:] != (J, 3):
@@ -37,7 +37,7 @@ class SurfaceCombination(ABC):
     @property
     @abstractmethod
     def skeleton(self) -> Skeleton:
-        """What the pose turns."""
+        """The skeleton that the pose turns."""
 
     @property
     @abstractmethod
@@ -47,48 +47,52 @@ class SurfaceCombination(ABC):
     @property
     @abstractmethod
     def load(self) -> int:
-        """Numbers that the derivatives of one coordinate of a point at one pose hold in between."""
+        """Memory estimate: numbers held while one coordinate of a point is differentiated at one pose."""
 
 
 class PointOperator(SurfaceCombination):
     """Some surface points of a fixed body as a function of pose and place, with derivatives.
 
-    Built by `Subject.points`; it never touches the mesh. The root's joint stands in `origin` (3,) when trans is zero.
+    Built by `Subject.points`; it never touches the mesh. The root's joint is at `origin` (3,) when trans is zero.
     """
 
     origin: np.ndarray
 
     @abstractmethod
     def relative_positions(self, pose: np.ndarray) -> np.ndarray:
-        """Places (..., 3, L) relative to `origin` at checked poses (..., J, 3), coordinates before points."""
+        """Compute positions (..., 3, L) relative to `origin` at checked poses (..., J, 3)."""
 
     @abstractmethod
     def columns(self, pose: np.ndarray, trans: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """As `jacobian`, with the derivatives as (..., 3J, 3, L), contiguous for each parameter."""
+        """Compute what `jacobian` does, with derivatives (..., 3J, 3, L) that are contiguous for each parameter."""
 
     @abstractmethod
     def combine(self, weights: np.ndarray | sparray) -> PointOperator:
-        """Linear combinations of the points, with weights (K, L); `origin` counts once, whatever their rows sum to."""
+        """Form combinations of the points with weights (K, L); `origin` counts once, whatever the rows sum to."""
 
     @abstractmethod
     def plus(self, factor: float, other: PointOperator) -> PointOperator:
-        """The sum with a multiple of another operator of the same model and points, origins included."""
+        """Add a multiple of another operator of the same model and points, origins included."""
 
     @abstractmethod
     def scale_by(self, factor: float) -> PointOperator:
-        """The same body larger or smaller about the root's joint."""
+        """Scale the body about the root's joint."""
 
     @abstractmethod
     def astype(self, dtype: Any) -> PointOperator:
-        """The same in float64, or in float32, which is twice as fast and agrees to a few micrometres."""
+        """Convert to float64, or to float32, which is twice as fast and agrees to a few micrometres."""
 
     def joints(self, regressor: sparray) -> PointOperator:
-        """The joints of a whole body: combinations (J, L) of the surface around them, unless they are its own."""
+        """Build the fast path of the joints, as combinations (J, L) of the surface around them.
+
+        Models with joints of their own override this.
+        """
         return self.combine(regressor)
 
     def evaluate(self, pose: np.ndarray, trans: np.ndarray | None = None) -> np.ndarray:
-        """Positions (..., L, 3) of the points at poses (..., J, 3) and trans (..., 3)."""
+        """Compute the positions (..., L, 3), metres, at poses (..., J, 3) and trans (..., 3)."""
         pose, trans = check_pose(self.skeleton, pose, trans)
+        # large batches go in pieces that fit into memory
         step = self._at_once(12)
         if pose.ndim == 2 or len(pose) <= step:
             y = self.relative_positions(pose)
@@ -98,11 +102,12 @@ class PointOperator(SurfaceCombination):
         return np.swapaxes(y, -1, -2)
 
     def _at_once(self, numbers: int) -> int:
-        """Poses that are worked on together, if each takes so many times `load` numbers."""
+        """Return how many poses to work on together, if each takes `numbers` times `load` numbers."""
+        # 2**24 numbers are 128 MB in float64
         return max(1, 2**24 // max(1, numbers * self.load))
 
     def jacobian(self, pose: np.ndarray, trans: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
-        """Positions (..., L, 3) and their derivatives (..., L, 3, 3J) by the pose, metres per radian.
+        """Compute the positions (..., L, 3) and their derivatives (..., L, 3, 3J) by the pose, metres per radian.
 
         A pose parameter rotates its part and all that hangs below it, and changes the features of its joint.
         The derivative with respect to trans is the identity.
@@ -115,20 +120,22 @@ class PointOperator(SurfaceCombination):
         y, d_pose = np.empty((B, L, 3)), np.empty((B, L, 3, 3 * J))
         step = self._at_once(3 * L)
         for start in range(0, B, step):
-            mine = slice(start, start + step)
-            y[mine], columns = self.columns(pose[mine], trans[mine])
-            d_pose[mine] = np.moveaxis(columns, (1, 2), (-1, -2))
+            batch = slice(start, start + step)
+            y[batch], columns = self.columns(pose[batch], trans[batch])
+            d_pose[batch] = np.moveaxis(columns, (1, 2), (-1, -2))
         return y, d_pose
 
 
 @dataclass(frozen=True, eq=False)
 class Subject:
-    """A body of fixed shape, ready to be posed fast.
+    """A body of fixed shape, ready to be posed fast; made by `BodyModel.subject`.
 
     Parameters
     ----------
     template : Mesh
+        N vertices, F triangles of the model.
     skeleton : Skeleton
+        J parts of the model.
     betas : (K,) float or None
         The body's shape; None is the template's own body.
     operator : PointOperator
@@ -141,6 +148,15 @@ class Subject:
         How far off the model predicted poses that were left out of learning.
     regressor : (J, N) sparse, optional
         Joints as combinations of vertices; else those of the skeleton's rings.
+
+    Examples
+    --------
+    >>> from model import load_built_in_model
+    >>> tall = load_built_in_model().subject([1.0], dtype=np.float32)
+    >>> tall.vertices(np.zeros((50, 16, 3))).shape
+    (50, 5002, 3)
+
+    [SCAPE] Eq. 9
     """
 
     template: Mesh
@@ -155,12 +171,12 @@ class Subject:
 
     @property
     def n_vertices(self) -> int:
-        """N."""
+        """N, the number of vertices."""
         return self.operator.count
 
     @property
     def origin(self) -> np.ndarray:
-        """(3,) metres: where the root's joint stands when trans is zero."""
+        """(3,) metres: the root's joint when trans is zero."""
         return self.operator.origin
 
     @cached_property
@@ -169,12 +185,14 @@ class Subject:
         return self.skeleton.joint_regressor(self.template) if self.regressor is None else self.regressor
 
     def vertices(self, poses: np.ndarray, trans: np.ndarray | None = None) -> np.ndarray:
-        """Vertices for one pose or a batch.
+        """Compute the vertices for one pose or a batch.
 
         Parameters
         ----------
         poses : (J, 3) or (B, J, 3) float, radians
-        trans : (3,) or (B, 3) float, metres
+            One pose or a batch.
+        trans : (3,) or (B, 3) float, metres, optional
+            Travel of the root's joint.
 
         Returns
         -------
@@ -183,9 +201,9 @@ class Subject:
         return self.operator.evaluate(poses, trans)
 
     def joints(self, poses: np.ndarray, trans: np.ndarray | None = None) -> np.ndarray:
-        """Joint centres (..., J, 3), metres, for poses (..., J, 3), radians, and trans (..., 3), metres.
+        """Compute the joint centres (..., J, 3), metres, for poses (..., J, 3), radians, and trans (..., 3), metres.
 
-        Affine combinations of the surface around them, or those that an imported model has of its own.
+        Joints are affine combinations of the surface around them; an imported model has its own.
         """
         return self._joints.evaluate(poses, trans)
 
@@ -194,7 +212,7 @@ class Subject:
         return self.operator.joints(self.joint_regressor).astype(np.float64)
 
     def points(self, vertex_ids: np.ndarray, weights: np.ndarray | None = None) -> PointOperator:
-        """Some surface points of the body.
+        """Build the fast path of some surface points of the body.
 
         Parameters
         ----------
@@ -212,17 +230,17 @@ class Subject:
 
 
 def combination_weights(n_vertices: int, vertex_ids: np.ndarray, weights: np.ndarray | None) -> csr_array:
-    """(L, N) surface points as combinations of vertices; arguments as of `Subject.points`."""
+    """Build the matrix (L, N) of surface points as combinations of vertices; arguments as of `Subject.points`."""
     ids, weights = check_combinations(n_vertices, vertex_ids, weights)
     share = np.ones(ids.shape) if weights is None else weights
     ends = np.arange(len(ids) + 1) * (ids.shape[1] if ids.ndim == 2 else 1)
-    found = csr_array((share.ravel(), ids.ravel(), ends), shape=(len(ids), n_vertices), copy=True)
-    found.sum_duplicates()
-    return found
+    matrix = csr_array((share.ravel(), ids.ravel(), ends), shape=(len(ids), n_vertices), copy=True)
+    matrix.sum_duplicates()
+    return matrix
 
 
 def find_single_rows(weights: np.ndarray | sparray) -> np.ndarray | None:
-    """(K,) the points, where weights (K, L) pick one each; None for true combinations."""
+    """Find the points (K,) that weights (K, L) pick one by one; None for true combinations."""
     if isinstance(weights, np.ndarray) or weights.nnz != weights.shape[0]:
         return None
     rows = csr_array(weights)
@@ -231,7 +249,7 @@ def find_single_rows(weights: np.ndarray | sparray) -> np.ndarray | None:
 
 def check_combinations(n_vertices: int, vertex_ids: np.ndarray, weights: np.ndarray | None
                        ) -> tuple[np.ndarray, np.ndarray | None]:
-    """Vertex indices and weights of surface points as arrays, or ValueError."""
+    """Check vertex indices and weights of surface points and return them as arrays; else ValueError."""
     ids = np.asarray(vertex_ids, dtype=np.int64)
     if ids.ndim != (1 if weights is None else 2):
         raise ValueError(f"vertex_ids: expected shape (L,), or (L, k) with weights, got {ids.shape}")

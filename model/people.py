@@ -1,4 +1,4 @@
-"""Whether the body that a model of people makes of betas is one that a person can have."""
+"""Plausibility of bodies of people: stature and volume."""
 from __future__ import annotations
 
 import numpy as np
@@ -14,11 +14,11 @@ ASKED = "betas are standard deviations, and hardly anybody is beyond 3"      # c
 
 
 def person_judgement(model: BodyModel, betas: np.ndarray | None, cause: str = "") -> Judgement:
-    """Whether the body of betas (k,) is one that a person can have; of models of other things nothing is said.
+    """Judge whether betas (k,) give a body that a person can have; models of other things are always good.
 
-    Without betas it is the template's own body. `cause` as in `beyond_people`.
+    Without betas it is the template's own body. `cause` is the likely reason that the message names.
     """
-    human = {"skullbase", "l_hip", "r_hip", "l_knee", "r_knee"}  # joints that a horse has not under these names
+    human = {"skullbase", "l_hip", "r_hip", "l_knee", "r_knee"}  # roles that only people's skeletons have
     if not find_roles(model.skeleton.names).keys() >= human:
         return Judgement()
     body = model.subject(betas).vertices(np.zeros((len(model.skeleton.parents), 3)))
@@ -26,6 +26,6 @@ def person_judgement(model: BodyModel, betas: np.ndarray | None, cause: str = ""
 
 
 def stature_and_volume(body: Mesh) -> tuple[float, float | None]:
-    """Metres along the tallest axis of a body that stands, and litres; None for a surface that is open."""
+    """Measure stature, metres, and volume, litres, of a standing body; no volume for an open surface."""
     height = float(np.ptp(body.vertices[:, tallest(body.vertices)]))
     return height, 1000 * abs(body.volume) if body.is_closed else None

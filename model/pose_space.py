@@ -32,7 +32,7 @@ class PoseSpace:
         return faces_of_part(self.skeleton)
 
     def gradients(self, pose: np.ndarray) -> np.ndarray:
-        """Q (..., F, 3, 3) at poses (..., J, 3), radians.
+        """Compute Q (..., F, 3, 3) at poses (..., J, 3), radians.
 
         [SCAPE] Eq. 3
         """
@@ -45,13 +45,13 @@ class PoseSpace:
         return Q
 
     def add(self, other: PoseSpace) -> PoseSpace:
-        """The pose space whose Q is the sum of two on the same skeleton, with the features of both."""
+        """Add a pose space on the same skeleton: Q is the sum, with the features of both."""
         one, two = self.features, other.features
         if one.lift.kind != two.lift.kind:
             raise ValueError(f"pose spaces: expected features of one kind, got {one.lift.kind} and {two.lift.kind}")
         part, mixes, coefficients = [], [], []
         for p, (a, b) in enumerate(zip(self.coefficients, other.coefficients, strict=True)):
-            part += [p] * (len(a) + len(b) - 1)                # of the two constants one is left
+            part += [p] * (len(a) + len(b) - 1)                # the two constants become one
             mixes += [one.mix[..., one.of_part(p)], two.mix[..., two.of_part(p)][..., 1:]]
             coefficients.append(np.concatenate([a[:1] + b[:1], a[1:], b[1:]]))
         features = PoseFeatures(self.skeleton, one.lift, np.array(part), np.concatenate(mixes, axis=-1))
@@ -59,19 +59,19 @@ class PoseSpace:
 
     @staticmethod
     def identity(skeleton: Skeleton) -> PoseSpace:
-        """The pose space without deformation: rigid parts, Q = I."""
+        """Build the pose space without deformation: rigid parts, Q = I."""
         features = linear_features(skeleton, tuple(np.zeros((3, 0)) for _ in skeleton.parents))
         return PoseSpace(features, tuple(np.broadcast_to(np.eye(3, dtype=np.float32), (1, len(f), 3, 3)).copy()
                                          for f in faces_of_part(skeleton)))
 
 
 def faces_of_part(skeleton: Skeleton) -> tuple[np.ndarray, ...]:
-    """The triangles of every part, in the order of the faces."""
+    """List the triangles of every part, in the order of the faces."""
     return tuple(np.flatnonzero(skeleton.part_of_face == p) for p in range(len(skeleton.parents)))
 
 
 def nearest_joints(template: Mesh, skeleton: Skeleton, count: int = 2) -> np.ndarray:
-    """(F, J) bool: the `count` joints of its part that lie nearest to each triangle on the template.
+    """Find the `count` joints of its part nearest to each triangle on the template, as (F, J) bool.
 
     [SCAPE] §4.2
     """
@@ -86,11 +86,12 @@ def nearest_joints(template: Mesh, skeleton: Skeleton, count: int = 2) -> np.nda
 
 
 def principal_directions(poses: np.ndarray, threshold: float) -> tuple[np.ndarray, ...]:
-    """J arrays (3, k_j): principal twist directions of variance at or above a threshold, rad², the largest first.
+    """Find the principal twist directions with at least a variance, rad²: J arrays (3, k_j), the largest first.
 
     [SCAPE] §4.2
     """
     observed = twists(poses)
+    # PCA of every joint's twists; the root has no twist, and directions never seen (1e-12) are always dropped
     kept = [np.zeros((3, 0))]
     for j in range(1, observed.shape[1]):
         centred = observed[:, j] - observed[:, j].mean(axis=0)

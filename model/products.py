@@ -1,8 +1,8 @@
-"""Points of a SCAPE body: linear in products of a feature δ and the rotation of a part, one matrix product for a batch.
+"""Points of a SCAPE body: linear in products of a feature δ and a part's rotation, so a batch is one matrix product.
 
     Y = Σ_m δ_m T_m R_mᵀ + origin + trans
 
-`T_m` is stitched once from the edges that the product contributes.
+`T_m` is stitched once from the edges that product m contributes.
 """
 from __future__ import annotations
 
@@ -23,8 +23,7 @@ from .linear import PointOperator, find_single_rows
 
 @dataclass(frozen=True, eq=False)
 class Terms:
-    """The products of a `feature` (M,) and the rotation of a `part` (M,) in which the vertices of a fixed body are
-    linear.
+    """The products in which the vertices of a fixed body are linear: `feature` (M,) times the rotation of `part` (M,).
     """
 
     features: PoseFeatures
@@ -42,21 +41,21 @@ class Terms:
 
     @cached_property
     def groups(self) -> list[tuple[slice, np.ndarray]]:
-        """Runs of products with features of one part, and the joints that these change with."""
+        """Runs of products with features of one part, and the joints that these features depend on."""
         ends = np.flatnonzero(np.diff(self.features.part[self.feature], append=-1)) + 1
         runs = [slice(start, end) for start, end in zip([0, *ends[:-1].tolist()], ends.tolist(), strict=True)]
-        found = [(run, np.flatnonzero(self.features.uses[self.feature[run]].any(axis=0))) for run in runs]
-        return [(run, joints) for run, joints in found if len(joints)]
+        groups = [(run, np.flatnonzero(self.features.uses[self.feature[run]].any(axis=0))) for run in runs]
+        return [(run, joints) for run, joints in groups if len(joints)]
 
     def weights(self, pose: np.ndarray) -> np.ndarray:
-        """(..., M, 3, 3) of δ R at poses (..., J, 3), radians."""
+        """Compute the products δ R (..., M, 3, 3) at poses (..., J, 3), radians."""
         R = self.skeleton.part_rotations(pose)[..., self.part, :, :]
         return self.features.evaluate(pose)[..., self.feature, None, None] * R
 
 
 @dataclass(frozen=True, eq=False)
 class Products(PointOperator):
-    """Points whose places are a sum of products, T (M, 3, L), metres: coordinates come before points."""
+    """Points that are a sum of products with T, the `basis` (M, 3, L), metres; coordinates come before points."""
 
     terms: Terms
     basis: np.ndarray
@@ -86,17 +85,18 @@ class Products(PointOperator):
     def columns(self, pose: np.ndarray, trans: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         terms, skeleton = self.terms, self.skeleton
         J, M, L, leading = len(skeleton.parents), terms.count, self.count, pose.shape[:-2]
+        # 1. a turn ω of a joint moves all that hangs below it by ω × C, with C_p = Σ_m δ_m T_m R_pᵀ
         R = skeleton.part_rotations(pose)
         turned = (R[..., terms.part, :, :] @ self.basis).reshape(*leading, M, 3 * L)
         gather = np.zeros((*leading, J, M))                                   # C_p = Σ_m δ_m T_m R_pᵀ
         gather[..., terms.part, np.arange(M)] = terms.features.evaluate(pose)[..., terms.feature]
         below = skeleton.descends.T.astype(float) @ gather                    # all that hangs below each joint
         carried = (below @ turned).reshape(*leading, J, 3, L)
-        # the features of a part change with its joints alone
+        # 2. the features of a part change with the parameters of its own joints only
         slopes, columns = terms.features.derivative(pose), np.zeros((*leading, J, 3, 3 * L))
-        for some, joints in terms.groups:
-            slope = slopes[..., terms.feature[some][:, None], joints, :].reshape(*leading, -1, 3 * len(joints))
-            change = np.swapaxes(slope, -1, -2) @ turned[..., some, :]
+        for run, joints in terms.groups:
+            slope = slopes[..., terms.feature[run][:, None], joints, :].reshape(*leading, -1, 3 * len(joints))
+            change = np.swapaxes(slope, -1, -2) @ turned[..., run, :]
             for k, j in enumerate(joints):
                 columns[..., j, :, :] += change[..., 3 * k:3 * k + 3, :]
         columns = columns.reshape(*leading, J, 9, L)
@@ -122,7 +122,7 @@ class Products(PointOperator):
 
 
 def _combine(basis: np.ndarray, weights: np.ndarray | sparray) -> np.ndarray:
-    """T (..., 3, L) of combinations of points."""
+    """Combine the points of T (..., 3, L) with weights (K, L)."""
     rows = find_single_rows(weights)
     if rows is not None:
         return np.take(basis, rows, axis=-1)
@@ -130,15 +130,17 @@ def _combine(basis: np.ndarray, weights: np.ndarray | sparray) -> np.ndarray:
         return basis @ weights.T.astype(basis.dtype)
     sparse = csr_array(weights)
     used, place = np.unique(sparse.indices, return_inverse=True)
-    few = csr_array((sparse.data, place, sparse.indptr), shape=(sparse.shape[0], len(used)))
-    some = np.take(basis, used, axis=-1).reshape(-1, len(used))
-    return np.ascontiguousarray((few @ some.T).T).reshape(*basis.shape[:-1], len(few.indptr) - 1)
+    mixed = csr_array((sparse.data, place, sparse.indptr), shape=(sparse.shape[0], len(used)))
+    used_points = np.take(basis, used, axis=-1).reshape(-1, len(used))
+    return np.ascontiguousarray((mixed @ used_points.T).T).reshape(*basis.shape[:-1], len(mixed.indptr) - 1)
 
 
 @dataclass(frozen=True, eq=False)
 class ShapedProducts(ShapedPoints):
-    """Points that are bilinear in (1, β) and products: T of every term (M, 3, L), metres, for the template's own body
-    and the mean person, and its change (K, M, 3, L) for one standard deviation of each beta.
+    """Points with unknown betas: bilinear in (1, β) and the products.
+
+    `own` and `mean` are T (M, 3, L), metres, of the template's own body and the mean person. `change` (K, M, 3, L) is
+    the change of T for one standard deviation of each beta.
     """
 
     terms: Terms
@@ -176,7 +178,7 @@ class ShapedProducts(ShapedPoints):
 
     @cached_property
     def _changes(self) -> Products:
-        """The changes of all points by all betas, as if each were a point."""
+        """The changes of all points by all betas, one after the other, in the place of points."""
         K, M, _, L = self.change.shape
         return Products(self.terms, np.moveaxis(self.change, 0, 2).reshape(M, 3, K * L), np.zeros(3))
 

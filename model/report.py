@@ -15,7 +15,7 @@ from .body import BodyModel
 
 
 def parts_panes(template: Mesh, skeleton: Skeleton) -> list[Pane]:
-    """Parts in colour, then joints and bones inside a transparent body."""
+    """Draw the parts in colour, then joints and bones inside a transparent body."""
     camera, = look_around(template, turns=(15,))
     joints, child = skeleton.joints, np.arange(1, len(skeleton.joints))
     inside: list[Shape] = [Solid(template, opacity=0.35), Dots(joints, radius=0.014, on_top=True),
@@ -25,13 +25,13 @@ def parts_panes(template: Mesh, skeleton: Skeleton) -> list[Pane]:
 
 
 def picture_parts(template: Mesh, skeleton: Skeleton, height: int = 640) -> np.ndarray:
-    """Parts and joints from the front, and the parts from the back."""
+    """Picture parts and joints from the front, and the parts from the back."""
     panes, (back,) = parts_panes(template, skeleton), look_around(template, turns=(195,))
     return picture_panes([*panes, replace(panes[0], camera=back, label="back")], height)
 
 
 def component_panes(model: BodyModel, count: int = 4, deviations: float = 2.0) -> list[Pane]:
-    """The mean person, then the first components at minus and plus some standard deviations.
+    """Draw the mean person, then the first components at minus and plus some standard deviations.
 
     [SCAPE] Eq. 7
     """
@@ -48,7 +48,7 @@ def component_panes(model: BodyModel, count: int = 4, deviations: float = 2.0) -
 
 
 def picture_components(model: BodyModel, height: int = 420) -> np.ndarray:
-    """What `component_panes` show.
+    """Picture the panes of `component_panes`.
 
     [SCAPE] Eq. 7
     """
@@ -56,11 +56,13 @@ def picture_components(model: BodyModel, height: int = 420) -> np.ndarray:
 
 
 def picture_character(model: BodyModel, count: int = 4, height: int = 420) -> np.ndarray:
-    """The character with its parts and with its joints, then in some poses of the model's people, far from rest."""
+    """Picture the character with its parts and its joints, then in poses of the model's people that are far from rest.
+    """
     skeleton, betas = model.skeleton, np.zeros(1)
     rest = np.zeros((len(skeleton.parents), 3))
     body = model.template.with_vertices(model.vertices(rest, betas))
     joints = model.joint_regressor @ body.vertices
+    # training poses from the most bent on; the more bent half is shown, evenly spread
     examples = model.pose_examples[np.argsort(-np.abs(model.pose_examples[:, 1:]).sum(axis=(1, 2)), kind="stable")]
     chosen = np.linspace(0, max(len(examples) - 1, 0) // 2, min(count, len(examples))).astype(int)
     poses = examples[chosen].reshape(-1, *rest.shape)

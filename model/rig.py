@@ -1,4 +1,4 @@
-"""A body as other programs move it: a mesh that hangs on joints by linear blend skinning."""
+"""Rigs: a body as animation programs move it, a mesh on joints with linear blend skinning."""
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
@@ -18,9 +18,9 @@ from .linear import Subject
 
 @dataclass(frozen=True, eq=False)
 class Correctives:
-    """What skinning lacks in one motion: changes of the rest mesh, and how much of each there is over time.
+    """Corrective shapes of one motion: changes of the rest mesh, and their weights over time.
 
-    Between the frames of the weights they go straight from one to the next, as in the files.
+    Between the frames that have weights, the weights are interpolated linearly, as in the files.
     """
 
     shapes: np.ndarray               # (C, N, 3) metres, at weight 1
@@ -28,18 +28,18 @@ class Correctives:
     frames: np.ndarray               # (n,) int, increasing: the frames of the motion that have these weights
 
     def changes(self, frames: np.ndarray) -> np.ndarray:
-        """The changes (..., N, 3) of the rest mesh in some frames (...) of the motion, metres."""
+        """Compute the changes (..., N, 3) of the rest mesh in some frames (...) of the motion, metres."""
         weights = np.stack([np.interp(frames, self.frames, w) for w in self.weights.T], axis=-1)
         return np.tensordot(weights, self.shapes, axes=1)
 
 
 @dataclass(frozen=True, eq=False)
 class Rig:
-    """A rest mesh, its skeleton, and how much each joint carries each vertex.
+    """A rest mesh, its skeleton, and the blend weights of its vertices.
 
-    A pose turns every part about its joint, by axes that are those of the world at rest, and the root's joint stands
-    at `joints[0] + trans`, as in the models. `axes` change neither poses nor surface: they are the frames that a file
-    gives its bones (`local_rotations`, `local_offsets`).
+    A pose turns every part about its joint, with axes parallel to the world's at rest. The root's joint is at
+    `joints[0] + trans`, as in the models. `axes` change neither poses nor surface: they are the local frames of the
+    bones in files (`local_rotations`, `local_offsets`).
     """
 
     mesh: Mesh                       # at rest: pose and trans are zero
@@ -70,10 +70,11 @@ class Rig:
 
     def vertices(self, poses: np.ndarray, trans: np.ndarray | None = None, changes: np.ndarray | None = None
                  ) -> np.ndarray:
-        """The skinned mesh (N, 3) or (T, N, 3), metres, in one pose (J, 3) or several (T, J, 3), radians.
+        """Compute the skinned mesh (N, 3) or (T, N, 3), metres, in one pose (J, 3) or several (T, J, 3), radians.
 
         `changes` (N, 3) or (T, N, 3), metres, are added to the rest mesh before it is skinned.
         """
+        # rigid motion of every part: rotation, and the translation that keeps its joint in place
         R = self.skeleton.part_rotations(poses)
         offset = joint_places(self.skeleton, poses, trans) - np.einsum("...jab,jb->...ja", R, self.skeleton.joints)
         motions = np.concatenate([R, offset[..., None]], axis=-1).reshape(-1, R.shape[-3], 12)
@@ -87,52 +88,52 @@ class Rig:
         return out.reshape(*poses.shape[:-2], *self.mesh.vertices.shape)
 
     def local_rotations(self, poses: np.ndarray) -> np.ndarray:
-        """(..., J, 3, 3) the bones against the bones they hang on, the root's in the world, of poses (..., J, 3)."""
+        """Compute rotations (..., J, 3, 3) of bones relative to their parents, for poses (..., J, 3)."""
         above = np.concatenate([np.eye(3)[None], self.axes[self.skeleton.parents[1:]]])
         return np.swapaxes(above, -1, -2) @ rotations.exp(poses) @ self.axes
 
     @property
     def local_offsets(self) -> np.ndarray:
-        """(J, 3) metres: every joint from the one it hangs on, by the axes of that bone; the root's in the world."""
+        """(J, 3) metres: offset of every joint from its parent in the parent bone's axes; the root's in the world."""
         joints, above = self.skeleton.joints, self.skeleton.parents[1:]
         return np.concatenate([joints[:1], np.einsum("jba,jb->ja", self.axes[above], joints[1:] - joints[above])])
 
     def beta_targets(self) -> tuple[list[str], np.ndarray]:
-        """Names of morph targets and their changes of the rest mesh (2K, N, 3), metres, at weight 1.
+        """Make morph targets: their names, and their changes of the rest mesh (2K, N, 3), metres, at weight 1.
 
-        Two for each beta, `beta 1 +3` and `beta 1 -3`: sliders from 0 to 1 reach so many standard deviations of
-        either sign.
+        Each beta has two, `beta 1 +3` and `beta 1 -3`. Sliders from 0 to 1 reach 3 standard deviations of either sign.
         """
-        slider = 3.0  # standard deviations that a morph target of a beta reaches at weight 1
+        slider = 3.0  # standard deviations at weight 1: hardly anybody is beyond 3
         names = [f"beta {k + 1} {sign}{slider:g}" for k in range(len(self.shapes)) for sign in "+-"]
         changes = slider * np.stack([self.shapes, -self.shapes], axis=1)
         return names, changes.reshape(-1, *self.mesh.vertices.shape)
 
     def transform(self, R: np.ndarray, shift: np.ndarray | float = 0.0) -> Rig:
-        """The same body turned by R (3, 3) and then shifted, metres; see `carried` for its poses and places."""
+        """Rotate the rig by R (3, 3) and then shift it, metres; `transform_rig` also changes its motion."""
         extra = self.correctives and replace(self.correctives, shapes=self.correctives.shapes @ R.T)
         return replace(self, mesh=self.mesh.with_vertices(self.mesh.vertices @ R.T + shift), shapes=self.shapes @ R.T,
                        skeleton=replace(self.skeleton, joints=self.skeleton.joints @ R.T + shift), axes=R @ self.axes,
                        correctives=extra)
 
     def with_up(self, up: int) -> Rig:
-        """The same body with the axis `up` turned to +y; poses and trans turn with `turn_up`."""
+        """Turn the axis `up` to +y; poses and trans turn with `turn_up`."""
         return self.transform(turn_up(up))
 
 
 def make_rig(model: BodyModel, betas: np.ndarray | None = None, shapes: int = 0, weights: np.ndarray | None = None
              ) -> Rig:
-    """The body of one person, ready for linear blend skinning.
+    """Build the rig of one person, for linear blend skinning.
 
     Parameters
     ----------
     model : BodyModel
+        A model of any kind.
     betas : (k,) float, optional
         None is the template's own body, which has no shapes.
     shapes : int
-        So many of the first betas become shapes; more than the model has are not asked for.
+        Number of first betas that become shapes, at most all of the model.
     weights : (N, J) float, optional
-        Else those of a skinning model, or `skin_weights`. Of every vertex the largest `CARRIERS` are kept.
+        Without them, those of a skinning model or of `skin_weights`. The largest `CARRIERS` of every vertex are kept.
 
     Raises
     ------
@@ -149,7 +150,7 @@ def make_rig(model: BodyModel, betas: np.ndarray | None = None, shapes: int = 0,
 
 
 def subject_rig(subject: Subject) -> Rig:
-    """The rig of a subject, without shapes."""
+    """Build the rig of a subject, without shapes."""
     skeleton, template = subject.skeleton, subject.template
     rest = subject.vertices(np.zeros(skeleton.joints.shape))
     return Rig(template.with_vertices(rest), replace(skeleton, joints=subject.joint_regressor @ rest),
@@ -157,17 +158,19 @@ def subject_rig(subject: Subject) -> Rig:
 
 
 def change_root(rig: Rig, poses: np.ndarray, trans: np.ndarray, root: str) -> tuple[Rig, np.ndarray, np.ndarray]:
-    """The same surface in the same motion, with a skeleton that hangs on another part.
+    """Make another part the root of the skeleton; the surface moves as before.
 
-    All parts turn as before and all joints between parts stay where they are; the root's own joint is the centroid of
-    the vertices of the part that is now the root, as in the models.
+    All parts turn as before and the joints between parts stay where they are. The new root's joint is the centroid of
+    its part's vertices, as in the models.
 
     Parameters
     ----------
     rig : Rig
+        The body.
     poses : (T, J, 3) float, radians
         T may be 0.
     trans : (T, 3) float, metres
+        Travel of the root's joint.
     root : str
         Name of a part.
 
@@ -180,6 +183,7 @@ def change_root(rig: Rig, poses: np.ndarray, trans: np.ndarray, root: str) -> tu
     if root not in old.names:
         raise ValueError(f"root: expected a part of the body ({', '.join(old.names)}), got {root!r}")
     links = np.stack([np.arange(1, len(old.parents)), old.parents[1:]], axis=1)
+    # links on the way from the new root to the old one change direction: parent and child swap
     order = reorder(old.part_of_face, links, old.names.index(root))
     now = np.argsort(order)                                           # new numbers of the old parts
     parents, joints = np.full(len(order), -1), old.joints[order]
@@ -188,6 +192,7 @@ def change_root(rig: Rig, poses: np.ndarray, trans: np.ndarray, root: str) -> tu
         parents[now[child]], joints[now[child]] = now[a + b - child], old.joints[a]
     new = Skeleton(now[old.part_of_face], parents, joints, tuple(old.names[p] for p in order))
     new = new.with_root_centred(rig.mesh)
+    # the motion of the new root: its rotation, and where its centroid goes
     R, first = old.part_rotations(poses), order[0]
     places = joint_places(old, poses, trans)[:, first] + R[:, first] @ (new.joints[0] - old.joints[first])
     return (replace(rig, skeleton=new, weights=rig.weights[:, order], axes=rig.axes[order]), new.pose_of(R[:, order]),
@@ -196,9 +201,9 @@ def change_root(rig: Rig, poses: np.ndarray, trans: np.ndarray, root: str) -> tu
 
 def transform_rig(rig: Rig, poses: np.ndarray, trans: np.ndarray, rest: tuple[np.ndarray, np.ndarray],
                   world: tuple[np.ndarray, np.ndarray]) -> tuple[Rig, np.ndarray, np.ndarray]:
-    """The same body, turned and shifted at rest by (R (3, 3), shift (3,)), and in its motion by those of `world`.
+    """Rotate and shift the body at rest by `rest`, and its motion by `world`, each a pair (R (3, 3), shift (3,)).
 
-    Poses (T, J, 3) radians, trans (T, 3) metres; T may be 0.
+    Poses are (T, J, 3), radians, trans (T, 3), metres; T may be 0.
     """
     (Q, shift), (W, step) = rest, world
     moved = rig.transform(Q, shift)
@@ -210,7 +215,7 @@ def transform_rig(rig: Rig, poses: np.ndarray, trans: np.ndarray, rest: tuple[np
 
 
 def joint_places(skeleton: Skeleton, poses: np.ndarray, trans: np.ndarray | None = None) -> np.ndarray:
-    """Where the joints (..., J, 3) of a skeleton with bones of fixed length stand, metres."""
+    """Compute the joint positions (..., J, 3), metres, of a skeleton with bones of fixed length."""
     R = skeleton.part_rotations(poses)
     out = np.empty(R.shape[:-1])
     out[..., 0, :] = skeleton.joints[0] + (0.0 if trans is None else np.asarray(trans))
@@ -222,7 +227,7 @@ def joint_places(skeleton: Skeleton, poses: np.ndarray, trans: np.ndarray | None
 
 def check_motion(skeleton: Skeleton, poses: np.ndarray, trans: np.ndarray | None, rate: float
                  ) -> tuple[np.ndarray, np.ndarray]:
-    """Poses (T, J, 3) and trans (T, 3) of a motion, or ValueError."""
+    """Check poses (T, J, 3), trans (T, 3) and rate of a motion, else ValueError."""
     poses = np.asarray(poses, dtype=np.float64)
     J = len(skeleton.parents)
     if poses.ndim != 3 or poses.shape[1:] != (J, 3) or not len(poses):

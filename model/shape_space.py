@@ -7,14 +7,15 @@ import numpy as np
 
 from scanprep.geometry.mesh import Mesh
 
-AT_ONCE = 20_000                     # entries of S that are near the processor together
+AT_ONCE = 20_000                     # entries of S that are worked on together, so that they stay in the cache
 
 
 @dataclass(frozen=True, eq=False)
 class ShapeSpace:
-    """S of every triangle as mean (F, 3, 3) plus components (K, F, 3, 3), each for one standard deviation of a beta.
+    """S of every triangle: mean (F, 3, 3), plus components (K, F, 3, 3) for one standard deviation of each beta.
 
-    With the variance of S over the training set along each component (K,), largest first, and in all directions.
+    `variances` (K,) are those of S over the training set along the components, largest first; `total_variance` is in
+    all directions.
 
     [SCAPE] Eq. 7
     """
@@ -35,7 +36,7 @@ class ShapeSpace:
         return np.cumsum(self.variances) / max(self.total_variance, np.finfo(float).tiny)
 
     def gradients(self, betas: np.ndarray | None) -> np.ndarray:
-        """S (F, 3, 3) of betas (k,), k ≤ K, in standard deviations; None is the template's own body, S = I.
+        """Compute S (F, 3, 3) of betas (k,), k ≤ K, in standard deviations; None is the template's own body, S = I.
 
         [SCAPE] Eq. 7
         """
@@ -50,14 +51,14 @@ class ShapeSpace:
         return S.reshape(self.mean.shape)
 
     def _check(self, betas: np.ndarray, dimensions: int) -> None:
-        """ValueError for betas (..., k) that this space has not."""
+        """Raise ValueError for betas (..., k) that this space does not have."""
         if betas.ndim != dimensions or betas.shape[-1] > self.count:
             raise ValueError(f"betas: expected at most {self.count} numbers, got shape {betas.shape}")
         if not np.isfinite(betas).all():
             raise ValueError("betas: expected finite numbers")
 
     def betas_of(self, S: np.ndarray) -> np.ndarray:
-        """Betas (P, K) nearest to shape deformations (P, F, 3, 3), by the components' right angles.
+        """Project shape deformations (P, F, 3, 3) onto the components, which are orthogonal: betas (P, K).
 
         [SCAPE] Eq. 7
         """
@@ -65,26 +66,26 @@ class ShapeSpace:
         return np.stack([flat @ (one - self.mean).ravel() for one in S]) / (flat**2).sum(axis=1)
 
     def first(self, count: int | None) -> ShapeSpace:
-        """The space of the first `count` components; None for all."""
+        """Keep the first `count` components; None keeps all."""
         return ShapeSpace(self.mean, self.components[:count], self.variances[:count], self.total_variance)
 
     @staticmethod
     def empty(n_faces: int) -> ShapeSpace:
-        """The space without components: only the template's own body."""
+        """Build the space without components: only the template's own body."""
         mean = np.broadcast_to(np.eye(3, dtype=np.float32), (n_faces, 3, 3)).copy()
         return ShapeSpace(mean, np.zeros((0, n_faces, 3, 3), dtype=np.float32), np.zeros(0), 0.0)
 
 
 def body_volumes(template: Mesh, bodies: np.ndarray) -> np.ndarray:
-    """Volume (P,) of bodies (P, N, 3), cubic metres, wherever they stand; of a body with holes, about its middle."""
+    """Compute the volumes (P,) of bodies (P, N, 3), cubic metres; of a body with holes, about its centroid."""
     return np.array([template.with_vertices(body - body.mean(axis=0)).volume for body in bodies])
 
 
 def learn_shape_space(S: np.ndarray, components: int, volumes: np.ndarray | None = None) -> ShapeSpace:
-    """Principal components of shape deformations (P, F, 3, 3), fewer where the people do not span as many.
+    """Compute principal components of shape deformations (P, F, 3, 3), fewer where the people do not span as many.
 
-    The sign of a component is free. With the volumes (P,) of the people it is chosen so that who has more of it has
-    more volume.
+    The sign of a component is free. With the volumes (P,) of the people it is chosen so that a positive beta means more
+    volume.
 
     [SCAPE] Eq. 7
     """
@@ -95,16 +96,18 @@ def learn_shape_space(S: np.ndarray, components: int, volumes: np.ndarray | None
 
 def principal_shapes(mean: np.ndarray, off: np.ndarray, count: float, components: int,
                      volumes: np.ndarray | None = None) -> ShapeSpace:
-    """Principal components of deviations (R, F, 3, 3) from a mean, whose products sum to `count` covariances.
+    """Compute principal components from deviations (R, F, 3, 3) whose products sum to `count` times the covariance.
 
-    `volumes` (R,), how much the volume deviates, choose the signs as in `learn_shape_space`.
+    `volumes` (R,) are deviations of the volume; they choose the signs as in `learn_shape_space`.
 
     [SCAPE] Eq. 7
     """
     rows = off.reshape(len(off), -1)
+    # R deviations are far fewer than 9F entries: PCA by the small Gram matrix (R, R)
     gram = np.asarray(rows @ rows.T, dtype=np.float64) / count
     variances, modes = np.linalg.eigh(gram)
     variances, modes = np.maximum(variances[::-1], 0), modes[:, ::-1]
+    # directions with no variance but rounding are no components
     K = min(components, int((variances > 1e-9 * max(variances[0], 1e-30)).sum()))
     # unit variance of betas: component k is one standard deviation, Σ_p modes[p, k] off[p] / √count
     directions = modes[:, :K].T.astype(rows.dtype) @ rows / np.sqrt(count)
@@ -116,21 +119,24 @@ def principal_shapes(mean: np.ndarray, off: np.ndarray, count: float, components
 
 def add_people(S: np.ndarray, volumes: np.ndarray, prior: np.ndarray, prior_volumes: np.ndarray, worth: float,
                components: int) -> ShapeSpace:
-    """Principal components of people and of what is known of others, which counts as `worth` people.
+    """Compute principal components of people together with a prior that counts as `worth` people.
 
-    Mean and covariance are those that a normal-inverse-Wishart prior and the people give together.
+    Mean and covariance are the posterior ones of a normal-inverse-Wishart prior.
 
     Parameters
     ----------
     S : (P, F, 3, 3) float
         Shape deformations of the people, of whom there may be none.
     volumes : (P,) float, cubic metres
+        Volumes of the people.
     prior : (1 + K, F, 3, 3) float
-        Of the mean person known before, and of one standard deviation along each known component.
+        The prior's mean person, then the body one standard deviation along each of its components.
     prior_volumes : (1 + K,) float, cubic metres
+        Volumes of the same bodies.
     worth : float
+        The prior counts as so many people.
     components : int
-        To keep at most.
+        Most components to keep.
 
     Returns
     -------
@@ -142,7 +148,7 @@ def add_people(S: np.ndarray, volumes: np.ndarray, prior: np.ndarray, prior_volu
     own = S.mean(axis=0, dtype=np.float64) if P else known
     mean = (P * own + worth * known) / (P + worth)
     apart, volume = np.sqrt(P * worth / (P + worth)), float(volumes.mean()) if P else float(prior_volumes[0])
-    # deviations whose products sum to the scatter: of the people, of the known components, of one mean from the other
+    # deviations whose products sum to the scatter: people from their mean, prior components, and mean from mean
     off = np.concatenate([S - own, np.sqrt(worth) * (prior[1:] - known), apart * (own - known)[None]])
     of_volume = np.r_[volumes - volume, np.sqrt(worth) * (prior_volumes[1:] - prior_volumes[0]),
                       apart * (volume - prior_volumes[0])]

@@ -1,4 +1,4 @@
-"""How the betas of people are spread: a Gaussian, one of each sex where a model tells women from men."""
+"""Statistics of the betas of people: a Gaussian, one for each sex where a model tells women from men."""
 from __future__ import annotations
 
 from dataclasses import dataclass
@@ -30,34 +30,36 @@ class ShapeStatistics:
 
     @cached_property
     def root(self) -> np.ndarray:
-        """(K, K) that turns standard normal numbers z into betas, `mean + root @ z`; root rootᵀ is the covariance."""
+        """(K, K) square root of the covariance: `mean + root @ z` are betas for standard normal z."""
         variance, axes = np.linalg.eigh(self.covariance)
         return axes * np.sqrt(np.maximum(variance, 0))
 
 
 def list_sexes(model: BodyModel) -> tuple[Sex, ...]:
-    """The sexes whose statistics a model keeps; none of most models."""
+    """List the sexes whose statistics a model holds; most models hold none."""
     return tuple(sex for sex in SEXES if sex in model.info.get("sexes", {}))
 
 
 def shape_statistics(model: BodyModel, sex: Sex | None = None) -> ShapeStatistics:
-    """Mean and covariance of the betas of people, or of those of one sex.
+    """Return mean and covariance of the betas of people, or of one sex.
 
     Parameters
     ----------
     model : BodyModel
+        A model with shape components.
     sex : {"female", "male"}, optional
-        Of a model of one sex alone, as `learn_by_sex` makes them, only its own.
+        A model of one sex alone (`learn_by_sex`) knows only its own.
 
     Returns
     -------
     ShapeStatistics
-        Without a sex mean 0 and covariance 1, which betas have over all people that the model was learned from.
+        `mean` (K,) and `covariance` (K, K). Without a sex they are 0 and 1: betas are standardised over all people
+        that the model was learned from.
 
     Raises
     ------
     ValueError
-        Another word, a sex asked of a model that does not tell women from men, or damaged statistics.
+        Another word, a model that does not tell women from men, or damaged statistics.
 
     Examples
     --------
@@ -76,9 +78,9 @@ def shape_statistics(model: BodyModel, sex: Sex | None = None) -> ShapeStatistic
     if sex not in list_sexes(model):
         raise ValueError(f"sex: the model does not tell women from men, so it has no {WORDS[sex]}; leave it out, or "
                          "take the built-in model, which is named people")
-    kept = model.info["sexes"][sex]
+    moments = model.info["sexes"][sex]
     try:
-        mean, covariance = (np.array(kept[name], dtype=np.float64) for name in ("mean", "covariance"))
+        mean, covariance = (np.array(moments[name], dtype=np.float64) for name in ("mean", "covariance"))
     except (KeyError, TypeError, ValueError) as error:
         raise ValueError(f"model: its statistics of {WORDS[sex]} are damaged ({error})") from None
     if mean.shape != (K,) or covariance.shape != (K, K) or not np.isfinite([*mean, *covariance.ravel()]).all():
@@ -88,10 +90,10 @@ def shape_statistics(model: BodyModel, sex: Sex | None = None) -> ShapeStatistic
 
 def draw_betas(model: BodyModel, count: int, rng: np.random.Generator, sex: Sex | None = None
                ) -> tuple[np.ndarray, tuple[Sex | None, ...]]:
-    """Betas (n, K) of random people, and their sexes.
+    """Draw betas (n, K) of random people, and their sexes.
 
-    Without a sex, of a model that knows both, every other one is a woman: one Gaussian over both would make people in
-    between. Of a model that knows none they are standard normal, and of no sex.
+    Without a sex, every other person of a model that knows both is a woman; one Gaussian over both would draw people in
+    between. A model that knows no sexes draws standard normal betas, with None as the sex.
 
     Examples
     --------
@@ -104,7 +106,7 @@ def draw_betas(model: BodyModel, count: int, rng: np.random.Generator, sex: Sex 
     both = list_sexes(model)
     if sex is not None or len(both) < 2:
         people = shape_statistics(model, sex)
-        # a unit covariance has roots in any direction: those who ask for none get the numbers as they are drawn
+        # without a sex the covariance is 1: the numbers stay as drawn, so that a seed always gives the same bodies
         return (z if sex is None else people.mean + z @ people.root.T), (sex,) * count
     of = {one: shape_statistics(model, one) for one in both}
     sexes = tuple(both[i % 2] for i in range(count))

@@ -1,4 +1,4 @@
-"""Linear blend skinning with pose-corrective shapes: learned beside SCAPE, or imported, under the same contract."""
+"""Linear blend skinning with pose-corrective shapes, learned or imported, with the interface of `BodyModel`."""
 from __future__ import annotations
 
 from collections.abc import Mapping
@@ -24,24 +24,25 @@ from .resolution.transfer import SurfaceCarrier
 
 @dataclass(frozen=True, eq=False, repr=False)
 class SkinningModel(BodyModel):
-    """A body whose vertices follow weighted means of the motions of its parts.
+    """Linear blend skinning with pose correctives: vertices follow weighted means of the motions of the parts.
 
     With rest vertices x, joints j, weights w and correctives c, all in the frames of the template,
 
         y_n = Σ_p w_np (R_p (x_n + c_n(pose) - j_p) + y_jp),    y_jp = y_jparent(p) + R_parent(p) (j_p - j_parent(p))
 
     and the body is then placed like every other. Rest vertices are affine in betas, and joints follow them. A model
-    with a regressor of its own is placed as its formula is published: trans moves the root's joint of these betas.
+    with a regressor of its own is placed as in its published formula: trans moves the root's joint of these betas.
 
     Parameters
     ----------
     template : Mesh
     skeleton : Skeleton
     rest : (N, 3) float, metres
-        The template's own body at zero pose: its vertices, or what learning made of them.
+        The template's own body at zero pose: the template's vertices, or those that learning adapted.
     weights : (N, J) float
-        Not negative, rows that sum to 1.
+        Blend weights, not negative; rows sum to 1.
     features : PoseFeatures
+        Functions of the pose in which the correctives are linear.
     correctives : (C, N, 3) float, metres
         Displacement of the rest vertices by every feature that is not a constant.
     shape_mean : (N, 3) float, metres
@@ -56,6 +57,18 @@ class SkinningModel(BodyModel):
         As for `BodyModel`.
     joint_components : (K, J, 3) float, metres, optional
         Change of the joints for one standard deviation of each beta, where they do not follow the rest vertices.
+
+    Raises
+    ------
+    ValueError
+        Arrays of another shape; weights that are negative or do not sum to 1.
+
+    Examples
+    --------
+    >>> from model import load_model
+    >>> model = load_model("people-fingers")
+    >>> model.kind, len(model.skeleton.parents), model.blend_rotations(np.zeros((46, 3))).shape
+    ('skinning', 46, (12500, 3, 3))
 
     Loper et al., SMPL, 2015.
     """
@@ -102,7 +115,7 @@ class SkinningModel(BodyModel):
 
     @cached_property
     def below(self) -> np.ndarray:
-        """(N, J) how much of each vertex follows each part or what hangs below it."""
+        """(N, J) sum of the weights of each part and of all that hangs below it."""
         return self.weights @ self.skeleton.descends
 
     @cached_property
@@ -111,7 +124,7 @@ class SkinningModel(BodyModel):
         return self.skeleton.joint_weights(self.template, 0)
 
     def rest_vertices(self, betas: np.ndarray | None) -> np.ndarray:
-        """Vertices (N, 3), metres, at zero pose of the body with betas (k,), k ≤ K; None is the template's own."""
+        """Compute the vertices (N, 3), metres, at zero pose for betas (k,), k ≤ K; None is the template's own body."""
         if betas is None:
             return self.rest.astype(np.float64)
         betas = np.asarray(betas, dtype=np.float64)
@@ -122,58 +135,63 @@ class SkinningModel(BodyModel):
         return self.shape_mean + np.tensordot(betas, self.shape_components[:len(betas)].astype(np.float64), axes=1)
 
     def rest_joints(self, betas: np.ndarray | None) -> np.ndarray:
-        """Joints (J, 3), metres, at zero pose of the body with betas (k,), k ≤ K; None is the template's own."""
+        """Compute the joints (J, 3), metres, at zero pose for betas (k,), k ≤ K; None is the template's own body."""
         x = self.rest_vertices(betas)
         if betas is None or self.joint_components is None:
             return np.asarray(self.joint_regressor @ x)
         return self.joint_regressor @ self.shape_mean + np.tensordot(betas, self.joint_components[:len(betas)], axes=1)
 
     def corrections(self, pose: np.ndarray) -> np.ndarray:
-        """Displacements (..., N, 3), metres, of the rest vertices at poses (..., J, 3)."""
+        """Compute the pose correctives (..., N, 3), metres: shifts of the rest vertices at poses (..., J, 3)."""
         delta = self.features.evaluate(pose)[..., self.features.constant == 0]
         return np.tensordot(delta, self.correctives.astype(np.float64), axes=1)
 
     def vertices_of(self, pose: np.ndarray, betas: np.ndarray | None) -> np.ndarray:
         x, joints, R = self.rest_vertices(betas), self.rest_joints(betas), self.skeleton.part_rotations(pose)
+        # joints in the posed body, parents first
         posed = joints.copy()
         for j in range(1, len(joints)):
             parent = self.skeleton.parents[j]
             posed[j] = posed[parent] + R[parent] @ (joints[j] - joints[parent])
+        # correctives at rest, then the weighted mean of all rigid motions
         x = x + self.corrections(pose)
         y = sum(self.weights[:, p, None] * ((x - joints[p]) @ R[p].T + posed[p]) for p in range(len(joints)))
+        # placed by the root's joint at rest, or by the centroid of the root's vertices
         if self.regressor is not None:
             return np.asarray(y - self.skeleton.joints[0])
         ids, share = self._root
         return np.asarray(y - share @ y[ids])
 
     def blend_rotations(self, pose: np.ndarray) -> np.ndarray:
-        """(N, 3, 3) the weighted mean of the rotations that carry each vertex, at a pose (J, 3)."""
+        """Compute the weighted mean of part rotations (N, 3, 3) of each vertex, at a pose (J, 3)."""
         return np.tensordot(self.weights, self.skeleton.part_rotations(pose), axes=1)
 
     def joint_turns(self, pose: np.ndarray) -> np.ndarray:
-        """(J, 3, 3) `R_parent - R` of every joint: with `below`, how the place of a joint moves a vertex.
+        """Compute `R_parent - R` (J, 3, 3) of every joint: with `below`, how a joint's position moves a vertex.
 
-        Written out, the chain of joints leaves `y = Σ_p w_p R_p x + Σ_j below_j (R_parent(j) - R_j) j_j`.
+        Written out, skinning is `y = Σ_p w_p R_p x + Σ_j below_j (R_parent(j) - R_j) j_j`.
         """
         R = self.skeleton.part_rotations(pose)
         turns = R[self.skeleton.parents] - R
-        turns[0] = 0                                                          # the root's place is trans
+        turns[0] = 0                                                          # trans places the root
         return turns
 
     @cached_property
     def _terms(self) -> Terms:
-        """The products that the middle of the root's vertices is a sum of: constants, then all parts with features."""
+        """The products whose sum is the centroid of the root's vertices: constants, then parts times features."""
         J, (ring, _) = len(self.skeleton.parents), self._root
         part, feature = np.meshgrid(np.flatnonzero((self.weights[ring] != 0).any(axis=0)),
                                     np.flatnonzero(self.features.constant == 0), indexing="ij")
         return Terms(self.features, np.r_[np.arange(J), part.ravel()], np.r_[self.features.starts, feature.ravel()])
 
     def _middle(self, x: np.ndarray, joints: np.ndarray, bends: bool) -> np.ndarray:
-        """T (M, 3, 1) of the middle of the root's vertices, which stays where it is, of a body with rest vertices x."""
+        """Compute T (M, 3, 1) of the centroid of the root's vertices, which is held, for rest vertices x (N, 3)."""
         (ring, share), J, terms = self._root, len(joints), self._terms
         T, weights, below = np.zeros((terms.count, 3)), share[:, None] * self.weights[ring], share @ self.below[ring]
+        # constant terms: each part's rotation times its vertices and joints
         T[:J] = weights.T @ x[ring] - below[:, None] * joints
         np.add.at(T, self.skeleton.parents[1:], below[1:, None] * joints[1:])
+        # correctives: each part's rotation times each feature
         if bends:
             each = np.einsum("rj,crd->jcd", weights, self.correctives[:, ring].astype(np.float64))
             T[J:] = each[(self.weights[ring] != 0).any(axis=0)].reshape(-1, 3)
@@ -182,6 +200,7 @@ class SkinningModel(BodyModel):
     @cached_property
     def everywhere(self) -> ShapedBlended:
         J, origin = len(self.skeleton.parents), self.skeleton.joints[0]
+        # correctives by the lifted twists of the joints, instead of by their mixtures
         mix = self.features.mix[1:, :, self.features.constant == 0]
         bends = np.tensordot(mix, self.correctives.astype(np.float64), axes=1).swapaxes(-1, -2)
         held, U = self.regressor is None, self.shape_components.astype(np.float64)
@@ -192,6 +211,7 @@ class SkinningModel(BodyModel):
             return Blended(self.features, self.weights, x, joints, np.ascontiguousarray(bends),
                            origin if held else joints[0], middle=middle)
 
+        # derivatives by the betas: of joints, and of the centroid that is held
         joints = self.joint_components
         if joints is None:
             joints = np.stack([self.joint_regressor @ u for u in U]) if len(U) else np.zeros((0, J, 3))
@@ -207,9 +227,9 @@ class SkinningModel(BodyModel):
         return whole.combine(combination_weights(len(self.rest), vertex_ids, weights))
 
     def unpose(self, vertices: np.ndarray, pose: np.ndarray) -> np.ndarray:
-        """(N, 3) rest vertices that the model carries onto a body (N, 3) exactly, joints of their own included.
+        """Find the rest vertices (N, 3) that the model carries onto a body (N, 3) exactly, with joints of their own.
 
-        The root's joint is where the template has it. `x = B⁻¹ (y - Σ_j below_j turn_j j_j) - c` with joints j = A x is
+        The root's joint is that of the template. `x = B⁻¹ (y - Σ_j below_j turn_j j_j) - c` with joints j = A x is
         first solved for the joints alone.
         """
         back, A, J = invert_blended(self.blend_rotations(pose)), self.joint_regressor, len(pose)
@@ -236,6 +256,7 @@ class SkinningModel(BodyModel):
         return np.moveaxis(self.correctives, 0, -1) if rotations_alone else None
 
     def resample(self, template: Mesh, skeleton: Skeleton, rounds: int, progress: Progress) -> SkinningModel:
+        # all fields are carried along the surface; weights stay positive
         follow = SurfaceCarrier(self.template, template)
 
         def displaced(field: np.ndarray) -> np.ndarray:
@@ -244,16 +265,16 @@ class SkinningModel(BodyModel):
         weights = np.maximum(follow.values(self.weights), 0)
         rest, shape_mean = (follow.positions(x.astype(np.float64)).astype(x.dtype)
                             for x in (self.rest, self.shape_mean))
-        # the variance is summed over the vertices, of which there are now more or fewer
+        # variances are sums over vertices, whose number changes
         per_vertex = len(template.vertices) / len(self.template.vertices)
         regressor = None
         if self.regressor is not None:
-            # joints of its own: combinations of the new vertices nearest to those of before and to the joint
+            # own joints: combinations of the new vertices nearest to the old ones and to the joint
             near, places, old = cKDTree(template.vertices), self.regressor @ self.template.vertices, self.regressor
             rows = np.zeros((len(places), len(template.vertices)))
             for j, place in enumerate(places):
-                theirs = self.template.vertices[old.indices[old.indptr[j]:old.indptr[j + 1]]]
-                chosen = np.union1d(near.query(theirs)[1], near.query(place, 8)[1])
+                old_vertices = self.template.vertices[old.indices[old.indptr[j]:old.indptr[j + 1]]]
+                chosen = np.union1d(near.query(old_vertices)[1], near.query(place, 8)[1])
                 rows[j, chosen] = affine_weights(template.vertices[chosen], place)
             regressor = csr_array(rows)
         return replace(
@@ -290,12 +311,13 @@ class SkinningModel(BodyModel):
         return cls(features=features, **parts, **stored)
 
 
+# arrays in files and their numbers of axes
 _STORED = {"rest": 2, "weights": 2, "correctives": 3, "shape_mean": 2, "shape_components": 3}
 
 
 def invert_blended(B: np.ndarray) -> np.ndarray:
-    """Inverses (N, 3, 3) of means of rotations, gently where they have collapsed."""
-    softest = 0.2  # a mean of rotations that shrinks further is not undone
+    """Invert blended rotations (N, 3, 3); where they have nearly collapsed, singular values are limited from below."""
+    softest = 0.2  # rotations that blend to less than a fifth cancel each other: their inverse would blow up noise
     flat = np.linalg.det(B) < softest
     if flat.any():
         U, s, Vt = np.linalg.svd(B[flat])

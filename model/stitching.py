@@ -1,4 +1,4 @@
-"""Vertices from triangle edges: the sparse solve that is the oracle of the fast path."""
+"""Vertices from triangle edges: the sparse solve, against which the fast path is tested."""
 from __future__ import annotations
 
 from functools import cached_property
@@ -14,8 +14,8 @@ from scanprep.skeleton.tree import Skeleton
 class StitchingSystem:
     """The least-squares fit of vertices to edges, factored once for a triangulation of one component.
 
-    Edges say nothing of where the body stands: the root's joint (the centroid of the vertices of part 0) is put in the
-    origin, and callers add the place.
+    Edges do not determine the place of the body. The root's joint (the centroid of the vertices of part 0) is put in
+    the origin, and callers add the place.
 
     [SCAPE] Eq. 2
     """
@@ -39,19 +39,23 @@ class StitchingSystem:
         return Factored(csc_array(self.edge_operator.T @ self.edge_operator + anchor))
 
     def solve(self, rhs: np.ndarray) -> np.ndarray:
-        """Solve the normal equations for `edge_operatorᵀ edges` (N, k), the root's joint in the origin."""
+        """Solve the normal equations for `edge_operatorᵀ edges` (N, k); the root's joint is put in the origin."""
         y = self._factored.solve(rhs)
         return y - self.root_weights @ y
 
     def solve_adjoint(self, pick: np.ndarray) -> np.ndarray:
-        """(N, k) with `solve_adjoint(pick).T @ rhs == pick.T @ solve(rhs)` for rhs that sum to zero."""
+        """Apply the adjoint of `solve` to (N, k): `solve_adjoint(pick).T @ rhs == pick.T @ solve(rhs)`.
+
+        This holds for right sides that sum to zero, as those of edges do.
+        """
         return self._factored.solve(pick - np.outer(self.root_weights, pick.sum(axis=0)))
 
     def stitch(self, edges: np.ndarray) -> np.ndarray:
-        """Vertices (..., N, 3) whose edges come closest to the wanted ones (..., F, 2, 3) in the least-squares sense.
+        """Find the vertices (..., N, 3) whose edges come closest to (..., F, 2, 3) in the least-squares sense.
 
         [SCAPE] Eq. 2, Eq. 9
         """
+        # all bodies and all three coordinates are columns of one right side
         leading = edges.shape[:-3]
         columns = np.moveaxis(edges.reshape(-1, 2 * len(self.faces), 3), 0, 1)
         rhs = self.edge_operator.T @ columns.reshape(2 * len(self.faces), -1)
@@ -60,7 +64,7 @@ class StitchingSystem:
 
 
 def edge_operator(faces: np.ndarray, n_vertices: int) -> csc_array:
-    """(2F, N) sparse: times vertices (N, 3) it gives the two edges of every triangle (F, 3), two rows each."""
+    """Build the sparse matrix (2F, N) that gives the two edges of every triangle (F, 3) from vertices (N, 3)."""
     row = np.arange(2 * len(faces))
     one = np.ones(len(row))
     end, start = faces[:, 1:].ravel(), np.repeat(faces[:, 0], 2)

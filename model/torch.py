@@ -1,13 +1,13 @@
 """Body models as PyTorch layers: for networks and optimisers that need gradients through the body.
 
-The layer computes what `model.vertices` does, by the same tables, and loses nothing: every kind of model is a sum of
-products of betas, pose features and rotations. Nothing else of the package imports this file or PyTorch.
+The layer computes what `model.vertices` does, from the same tables: every kind of model is a sum of products of betas,
+pose features and rotations. Nothing else in the package imports this file or PyTorch.
 
-A SCAPE body is made part by part, as in `model.condensed`. Inside part p, before the parts are joined,
+A SCAPE body is computed part by part, as in `model.condensed`. Inside part p, before the parts are joined,
 
     U_p = R_p Σ_ak δ_a β_k T_pak,    k = 0 for the mean person, whose β is 1
 
-is one matrix product for a batch of bodies, `(B, n (1 + K)) @ (n (1 + K), 3 rows)`, whether they share betas or not.
+is one matrix product for a batch of bodies, `(B, n (1 + K)) @ (n (1 + K), 3 rows)`, whether or not they share betas.
 
 [SCAPE] Eq. 6, Eq. 9
 """
@@ -32,7 +32,7 @@ from .products import Products, ShapedProducts, Terms
 
 
 def rotation_matrices(twist: Tensor) -> Tensor:
-    """Rotation matrices (..., 3, 3) of rotation vectors (..., 3), radians, with finite gradients at 0 and π.
+    """Compute rotation matrices (..., 3, 3) of rotation vectors (..., 3), radians, with finite gradients at 0 and π.
 
     Examples
     --------
@@ -41,6 +41,7 @@ def rotation_matrices(twist: Tensor) -> Tensor:
     """
     square = (twist * twist).sum(-1)[..., None, None]
     sine, half = _sine_ratio(square), _sine_ratio(square / 4)
+    # Rodrigues' formula: I + sin θ / θ K + (1 - cos θ) / θ² K², with 1 - cos θ = 2 sin²(θ / 2)
     x, y, z = twist.unbind(-1)
     zero = torch.zeros_like(x)
     K = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], -1).unflatten(-1, (3, 3))
@@ -48,8 +49,8 @@ def rotation_matrices(twist: Tensor) -> Tensor:
 
 
 def _sine_ratio(square: Tensor) -> Tensor:
-    """sin θ / θ of θ²."""
-    # square radians below which a series is exact to 1e-12
+    """Compute sin θ / θ from θ²."""
+    # below 1e-3 square radians the series is exact to 1e-12, and has gradients at 0
     small = square < 1e-3
     angle = torch.where(small, torch.ones_like(square), square).sqrt()
     series = 1 - square / 6 * (1 - square / 20 * (1 - square / 42))
@@ -57,10 +58,11 @@ def _sine_ratio(square: Tensor) -> Tensor:
 
 
 def wrap_twists(pose: Tensor) -> Tensor:
-    """Twists (..., 3), at most π long, of rotation vectors (..., 3) of any length, radians.
+    """Compute twists (..., 3), at most π long, of rotation vectors (..., 3) of any length, radians.
 
     [SCAPE] §4.2
     """
+    # beyond π, whole turns are taken off the angle; the axis stays, or is reversed
     square = (pose * pose).sum(-1, keepdim=True)
     far = square > math.pi**2
     angle = torch.where(far, square, torch.ones_like(square)).sqrt()
@@ -88,16 +90,17 @@ LIFTS: dict[str, Callable[[Tensor], Tensor]] = {
 
 
 class _Points(nn.Module):
-    """Points (B, L, 3), metres, of one kind of arrays; `own` and `mean` bodies differ in their buffers."""
+    """Base of the layers that compute points (B, L, 3), metres; the template's own and the mean body have own buffers.
+    """
 
     n_betas: int
 
     def keep(self, name: str, value: np.ndarray) -> None:
-        """A buffer: numbers in the layer's type, or places."""
+        """Register an array as a buffer: numbers in the layer's type, or indices."""
         self.register_buffer(name, torch.from_numpy(np.array(value)))
 
     def forward(self, R: Tensor, features: Tensor, lifted: Tensor, betas: Tensor | None) -> Tensor:
-        """Points where trans is zero, for part rotations (B, J, 3, 3), features (B, A), lifted twists (B, J, m)."""
+        """Compute the points at trans zero for part rotations (B, J, 3, 3), features (B, A), lifted twists."""
         raise NotImplementedError
 
 
@@ -121,16 +124,17 @@ class _CondensedPoints(_Points):
             if shaped is not None and flat is not None:
                 changes = shaped.flat[:, flat[p]].reshape(self.n_betas, *mean.tables[p].shape)
             for rotation in np.unique(terms.part[products]):
-                some = np.flatnonzero(terms.part[products] == rotation)
-                features = terms.feature[products][some]
+                chosen = np.flatnonzero(terms.part[products] == rotation)
+                features = terms.feature[products][chosen]
                 assert (np.diff(features) == 1).all(), "features of one part stand side by side"
                 number = len(self.blocks)
-                self.keep(f"own{number}", own.tables[p][some].reshape(len(some), 3 * rows))
+                self.keep(f"own{number}", own.tables[p][chosen].reshape(len(chosen), 3 * rows))
                 # (1 + K, n, 3 rows): the mean person, then by each beta
-                shapes = np.concatenate([mean.tables[p][None, some], changes[:, some]])
-                self.keep(f"table{number}", shapes.reshape(1 + self.n_betas, len(some), 3 * rows))
+                shapes = np.concatenate([mean.tables[p][None, chosen], changes[:, chosen]])
+                self.keep(f"table{number}", shapes.reshape(1 + self.n_betas, len(chosen), 3 * rows))
                 self.blocks.append((p, int(rotation), rows, slice(int(features[0]), int(features[-1]) + 1)))
 
+        # how borders follow from loads, and insides from borders
         self.inside = [len(part.inside) for part in system.parts]
         for p, part in enumerate(system.parts):
             self.keep(f"spread{p}", np.ascontiguousarray(part.spread.T))
@@ -142,22 +146,22 @@ class _CondensedPoints(_Points):
         self.n_loads = n + 1
 
     def forward(self, R: Tensor, features: Tensor, lifted: Tensor, betas: Tensor | None) -> Tensor:
-        # U of the vertices inside each part, and its loads on the border, turned with the part
+        # 1. U of the vertices inside each part and its loads on the border, rotated with the part
         local: list[Tensor] = [features.new_zeros(0)] * self.n_parts
-        for number, (p, rotation, rows, some) in enumerate(self.blocks):
-            delta = features[:, some]
+        for number, (p, rotation, rows, of_features) in enumerate(self.blocks):
+            delta = features[:, of_features]
             table = getattr(self, f"own{number}")
             if betas is not None:
                 shapes = getattr(self, f"table{number}")[:1 + betas.shape[-1]]
-                if betas.shape[0] == 1:                        # one person: the tables first
+                if betas.shape[0] == 1:                        # one person: combine the tables once for all poses
                     table = shapes[0] + (betas[0] @ shapes[1:].flatten(1)).unflatten(0, shapes.shape[1:])
-                else:                                          # one product for all people
+                else:                                          # several people: products of betas and features first
                     one = torch.cat([torch.ones_like(betas[:, :1]), betas], -1)
                     delta, table = (one[:, :, None] * delta[:, None]).flatten(1), shapes.flatten(0, 1)
             turned = R[:, rotation] @ (delta @ table).unflatten(-1, (3, rows))                 # (B, 3, rows)
             local[p] = turned if local[p].numel() == 0 else local[p] + turned
 
-        # where the loads bring the border, and how the insides follow it
+        # 2. the border from the loads of all parts, and the insides that follow it
         left = torch.cat([rows[..., i:] for rows, i in zip(local, self.inside, strict=True)], -1)
         loads = left.new_zeros((*left.shape[:-1], self.n_loads)).index_add(-1, self.loads, left)
         around = loads @ self.answer
@@ -168,7 +172,7 @@ class _CondensedPoints(_Points):
 
 
 class _ProductPoints(_Points):
-    """Some points of a SCAPE body, or of any kind that is a sum of products; see `model.products`."""
+    """Chosen points of a SCAPE body, or of any kind of model that is a sum of products; see `model.products`."""
 
     def __init__(self, points: ShapedProducts | Products) -> None:
         super().__init__()
@@ -186,6 +190,7 @@ class _ProductPoints(_Points):
         self.keep("origin", points.origin)
 
     def forward(self, R: Tensor, features: Tensor, lifted: Tensor, betas: Tensor | None) -> Tensor:
+        # δ R of every product, then one matrix product with the table of these betas
         delta = features.index_select(-1, self.feature)
         W = delta[:, :, None, None] * R.index_select(1, self.part)                             # (B, M, i, j)
         W = W.transpose(1, 2).flatten(2)                                                       # (B, i, 3M)
@@ -228,7 +233,7 @@ class _BlendedPoints(_Points):
 
     def forward(self, R: Tensor, features: Tensor, lifted: Tensor, betas: Tensor | None) -> Tensor:
         def of(name: str) -> Tensor:
-            """(1 or B, ...) an array of the body with these betas."""
+            """Return an array (1 or B, ...) of the body with these betas."""
             if betas is None:
                 return getattr(self, f"own_{name}")[None]
             table = getattr(self, f"table_{name}")
@@ -238,7 +243,7 @@ class _BlendedPoints(_Points):
         if self.bends.numel():
             x = x + (lifted[:, 1:].flatten(1) @ self.bends).unflatten(-1, (-1, 3))
 
-        # joints hang on those above them; what follows each part is then y_j - R j
+        # translation y_j - R j of every part, then the weighted mean of all motions
         y = chain_joints(R, joints, self.parents)
         t = y - (R @ joints[..., None])[..., 0]
         motion = self.weights @ torch.cat([R, t[..., None]], -1).flatten(2)                    # (B, n, 12)
@@ -252,7 +257,7 @@ class _BlendedPoints(_Points):
 
 
 def chain_joints(R: Tensor, joints: Tensor, parents: list[int]) -> Tensor:
-    """(B, J, 3) where joints at rest (B, J, 3) go with part rotations (B, J, 3, 3), the root's zero."""
+    """Compute posed joints (B, J, 3) from joints at rest (B, J, 3) and part rotations (B, J, 3, 3); the root's is 0."""
     y = [torch.zeros_like(R[:, 0, 0])]
     for j in range(1, len(parents)):
         p = parents[j]
@@ -261,7 +266,7 @@ def chain_joints(R: Tensor, joints: Tensor, parents: list[int]) -> Tensor:
 
 
 class _ChainedJoints(_Points):
-    """The joints that an imported model has of its own: they hang on each other, and no vertex says where they are."""
+    """The joints of an imported model, which are a chain of bones and not combinations of posed vertices."""
 
     def __init__(self, points: _BlendedPoints) -> None:
         super().__init__()
@@ -279,7 +284,7 @@ class _ChainedJoints(_Points):
 
 
 def _points_layer(points: ShapedPoints | PointOperator, parents: np.ndarray) -> _Points:
-    """The layer of an array kind, or ValueError."""
+    """Build the layer for a kind of points; ValueError for an unknown kind."""
     if isinstance(points, ShapedCondensed | Condensed):
         return _CondensedPoints(points)
     if isinstance(points, ShapedBlended | Blended):
@@ -297,8 +302,7 @@ class BodyLayer(nn.Module):
     body : BodyModel or Subject
         A model of any kind, or a person of fixed shape, who has no betas.
     vertices : (L,) int, optional
-        Only these vertices, in this order. The others are never computed: a fit to a few markers takes a fraction of
-        the time.
+        Only these vertices, in this order. The others are never computed, so a fit to a few markers is much faster.
     dtype : torch.dtype
         float32, or float64 which agrees with the model to 1e-10 m. `layer.to(device)` as for every module.
 
@@ -358,6 +362,7 @@ class BodyLayer(nn.Module):
                 raise ValueError(f"vertices: expected places of 0..{N - 1}, got {np.shape(vertices)} {ids.ravel()[:5]}")
             self.n_points = len(ids)
             self.points = _points_layer(body.points(ids), skeleton.parents)
+        # joints: a chain, points of their own, or combinations of all vertices that are computed anyway
         self.joints: _Points | None = None
         if isinstance(self.points, _BlendedPoints) and not self.points.held:
             self.joints = _ChainedJoints(self.points)
@@ -377,7 +382,7 @@ class BodyLayer(nn.Module):
     def forward(self, poses: Tensor | None = None, betas: Tensor | None = None, trans: Tensor | None = None,
                 vertices: Tensor | None = None, *, global_orient: Tensor | None = None,
                 body_pose: Tensor | None = None, transl: Tensor | None = None) -> tuple[Tensor, Tensor]:
-        """Vertices and joints of a batch of bodies, or of one body where poses and betas have no batch.
+        """Compute vertices and joints of a batch of bodies, or of one body where poses and betas have no batch.
 
         Parameters
         ----------
@@ -386,8 +391,9 @@ class BodyLayer(nn.Module):
         betas : (B, k), (1, k) or (k,) tensor, k ≤ K, standard deviations, optional
             None is the template's own body; zeros are the mean person.
         trans : (B, 3) or (3,) tensor, metres, optional
+            Travel of the root's joint; zero where none is given.
         vertices : (L,) int tensor, optional
-            Return these only. They are chosen at the end: where they stay the same, build the layer of them.
+            Return these only. All are computed first; for a fixed choice give `vertices` to the layer instead.
         global_orient : (B, 3) tensor, radians, optional
             The first row of poses, under the name smplx gives it.
         body_pose : (B, 3 (J - 1)) or (B, J - 1, 3) tensor, radians, optional
@@ -405,7 +411,8 @@ class BodyLayer(nn.Module):
         ValueError
             Shapes that do not fit, or one thing given under two names.
         """
-        poses, trans = self._named(poses, trans, global_orient, body_pose, transl)
+        # arguments under either name, with shapes that fit
+        poses, trans = self._resolve_names(poses, trans, global_orient, body_pose, transl)
         like = self.mix
         pose = like.new_zeros(self.n_joints, 3) if poses is None else poses
         if pose.shape[-1] == 3 * self.n_joints:
@@ -418,6 +425,7 @@ class BodyLayer(nn.Module):
         if betas is not None and betas.shape[-1] > self.n_betas:
             raise ValueError(f"betas: expected at most {self.n_betas} numbers, got shape {tuple(betas.shape)}")
 
+        # one batch size for all: what has size 1 is repeated
         batched = pose.ndim == 3 or any(x is not None and x.ndim == 2 for x in (betas, trans))
         pose = pose if pose.ndim == 3 else pose[None]
         betas, trans = (x if x is None or x.ndim == 2 else x[None] for x in (betas, trans))
@@ -442,16 +450,16 @@ class BodyLayer(nn.Module):
         return (y, joints) if batched else (y[0], joints[0])
 
     def _rotations(self, pose: Tensor) -> Tensor:
-        """World rotations (B, J, 3, 3) of the parts: `R_j = R_parent(j) exp(pose_j)`."""
+        """Compute the world rotations (B, J, 3, 3) of the parts: `R_j = R_parent(j) exp(pose_j)`."""
         relative = rotation_matrices(pose)
-        found = [relative[:, self.depths[0]]]
+        by_depth = [relative[:, self.depths[0]]]
         for parts, above in zip(self.depths[1:], self.above, strict=True):
-            found.append(found[-1][:, above] @ relative[:, parts])
-        return torch.cat(found, 1)[:, self.back]
+            by_depth.append(by_depth[-1][:, above] @ relative[:, parts])
+        return torch.cat(by_depth, 1)[:, self.back]
 
     def _resolve_names(self, poses: Tensor | None, trans: Tensor | None, global_orient: Tensor | None,
                        body_pose: Tensor | None, transl: Tensor | None) -> tuple[Tensor | None, Tensor | None]:
-        """Poses and trans, whichever names they came under."""
+        """Return poses and trans, given under our names or those of smplx; ValueError for both."""
         if transl is not None:
             if trans is not None:
                 raise ValueError("trans, transl: expected one of them, they are the same")
@@ -460,6 +468,7 @@ class BodyLayer(nn.Module):
             return poses, trans
         if poses is not None:
             raise ValueError("poses: expected none beside global_orient and body_pose, which are its rows")
+        # rows of the pose, one of which may be missing and is then zero
         root = None if global_orient is None else global_orient.flatten(1) if global_orient.ndim > 1 else \
             global_orient[None]
         others = None if body_pose is None else body_pose.flatten(1) if body_pose.ndim > 1 else body_pose[None]
@@ -475,7 +484,7 @@ class BodyLayer(nn.Module):
 
 
 def _features_of(operator: PointOperator) -> PoseFeatures:
-    """The pose features of a person's operator."""
+    """Return the pose features of a subject's operator."""
     if isinstance(operator, Blended):
         return operator.features
     assert isinstance(operator, Condensed | Products), "no other operator has a layer"
@@ -483,7 +492,7 @@ def _features_of(operator: PointOperator) -> PoseFeatures:
 
 
 def _pad_regressor(regressor: csr_array) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices (J, k) and weights (J, k) of a regressor (J, N), rows filled up with weights of zero."""
+    """Convert a regressor (J, N) to vertices (J, k) and weights (J, k), filled up with weights of zero."""
     counts = np.diff(regressor.indptr)
     ids, weights = np.zeros((2, len(counts), counts.max()))
     for j, (start, count) in enumerate(zip(regressor.indptr, counts, strict=False)):

@@ -1,6 +1,6 @@
-"""`scape prep`: the stages from raw scans to a registered set, and all of them in one.
+"""`scape prep`: the stages from raw scans to a registered set, and all of them in one command.
 
-Each room has its commands in its own `cli.py`; here is the list of them and what they share.
+Each subpackage has its commands in its own `cli.py`; here is their list, and what they share.
 """
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from .arguments import Alias, Called, Place
 from .command_line import dispatch
 from .console import Metric
 
-if TYPE_CHECKING:               # imported where they are used: this module must answer --help at once
+if TYPE_CHECKING:               # heavy imports are inside functions: --help must answer at once
     from .geometry.mesh import Mesh
 
 Unit = Literal["m", "mm", "cm", "in"]
@@ -21,9 +21,10 @@ ScanArg = Annotated[Path, Place("SCAN")]
 MeshArg = Annotated[Path, Place("MESH")]
 SetArg = Annotated[Path, Place("SET")]
 Output = Annotated[Path, Alias("-o")]
-Person = Called("--person")         # whose scans; `--subject` is a body elsewhere: betas or a mesh
-MM = 1000.0
+Person = Called("--person")         # whose scans; in other commands `--subject` is a body
+MM = 1000.0                         # millimetres in a metre
 
+# name -> line of help, function
 COMMANDS = {
     "run": ("Scans -> registered set with a skeleton; goes on where it was interrupted.",
             "scanprep.pipeline.cli:run_all"),
@@ -50,28 +51,28 @@ COMMANDS = {
 
 
 def group(argv: list[str]) -> int:
-    """The commands of `scape prep`."""
+    """Run one of the commands of `scape prep`."""
     return dispatch(COMMANDS, "scape prep", argv, "From raw scans to registered meshes and a skeleton.")
 
 
 def read_poses(folder: Path, template: Path | None, subject: str | None, unit: Unit | None) -> tuple[Mesh, np.ndarray]:
-    """Template and vertices (M, N, 3) of one person from a registered set or a folder of meshes."""
+    """Read template and vertices (M, N, 3) of one person from a registered set or a folder of meshes."""
     from .dataset import RegisteredSet
     from .geometry.files import read_mesh, read_registered
     from .geometry.mesh import Mesh
 
     if (folder / "set.json").exists():
-        whole = RegisteredSet.load(folder)
-        return whole.template, whole.poses(subject)
-    found = read_registered(folder, unit)
-    body = read_mesh(template, unit) if template else Mesh(found.vertices[0], found.faces)
-    if not np.array_equal(body.faces, found.faces):
+        registered = RegisteredSet.load(folder)
+        return registered.template, registered.poses(subject)
+    meshes = read_registered(folder, unit)
+    mesh = read_mesh(template, unit) if template else Mesh(meshes.vertices[0], meshes.faces)
+    if not np.array_equal(mesh.faces, meshes.faces):
         raise ValueError(f"{template}: expected the triangles of the meshes in {folder}; it has other ones")
-    return body, found.vertices
+    return mesh, meshes.vertices
 
 
 def about_mesh(mesh: Mesh) -> list[Metric]:
-    """The rows of the closing table that describe a mesh."""
+    """Return the rows of the closing table that describe a mesh."""
     from .geometry.mesh import template_problem
 
     problem = template_problem(mesh)

@@ -1,7 +1,7 @@
-"""Settings in files: what has no flag on the command line is set by `--config FILE`, in TOML.
+"""Settings in files: those without a flag on the command line are set by `--config FILE`, in TOML.
 
-The names are those of the settings' dataclasses. A command with one dataclass has its fields at the top of the file;
-one with several has a table for each, named as the parameter of the Python function.
+The names are those of the fields of the settings. A command with one group of settings has its fields at the top of
+the file; one with several has a table for each, named like the parameter of the Python function.
 """
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ from pathlib import Path
 from typing import Any
 
 from .geometry import storage
-from .ranges import FLAG, OutOfRange, Settings, marks
+from .ranges import FLAG, OutOfRangeError, Settings, marks
 
-Path_ = tuple[str, ...]              # of a field: the parameter, then the names of nested settings down to it
+Path_ = tuple[str, ...]              # path of a field: parameter, then names of nested settings
 
 
 @dataclasses.dataclass(frozen=True)
 class Flag:
-    """A field of settings that is a flag of the command line too: where it stands, its type, value and sentence."""
+    """A field of settings that is also a flag: where it is, its type, value and description."""
 
     path: Path_
     annotation: Any
@@ -33,76 +33,78 @@ class Flag:
 
 
 def flags(settings: Mapping[str, Settings]) -> dict[str, Flag]:
-    """The marked fields of settings by the names of their flags, which are those of the fields."""
-    found: dict[str, Flag] = {}
+    """Find the marked fields of settings; a flag has the name of its field."""
+    by_name: dict[str, Flag] = {}
     for parameter, config in settings.items():
         for flag in _flags((parameter,), config):
-            assert flag.path[-1] not in found, f"two settings have a flag {flag.path[-1]}"
-            found[flag.path[-1]] = flag
-    return found
+            assert flag.path[-1] not in by_name, f"two settings have a flag {flag.path[-1]}"
+            by_name[flag.path[-1]] = flag
+    return by_name
 
 
 def _flags(path: Path_, config: Settings) -> Iterator[Flag]:
-    told, hints = settings_sentences(type(config)), _hints(type(config))
+    """Yield the marked fields of settings and of the settings inside them."""
+    sentences, hints = settings_sentences(type(config)), _hints(type(config))
     for field in dataclasses.fields(config):
         value = getattr(config, field.name)
         if FLAG in marks(hints[field.name]):
-            yield Flag((*path, field.name), hints[field.name], value, told.get(field.name, ""))
+            yield Flag((*path, field.name), hints[field.name], value, sentences.get(field.name, ""))
         elif isinstance(value, Settings):
             yield from _flags((*path, field.name), value)
 
 
 def replace_at(config: Settings, path: Path_, value: Any) -> Settings:
-    """Settings with another value at a path of field names."""
+    """Return settings with another value at a path of field names."""
     first, *rest = path
     inner = replace_at(getattr(config, first), tuple(rest), value) if rest else value
     return dataclasses.replace(config, **{first: inner})
 
 
 def settings_sentences(cls: type[Settings]) -> dict[str, str]:
-    """What the docstrings of settings, and of those that they extend, say of each field."""
-    fields, found = {field.name for field in dataclasses.fields(cls)}, dict[str, list[str]]()
+    """Read what the docstrings of settings, and of their base classes, say of each field."""
+    fields, lines_of = {field.name for field in dataclasses.fields(cls)}, dict[str, list[str]]()
     for owner in reversed(cls.__mro__):
         names: list[str] = []
         listed = re.split(r"(?:Attributes|Parameters)\n *-+\n", inspect.cleandoc(owner.__doc__ or ""))[-1]
         for line in listed.splitlines():
             if line and not line.startswith(" "):
                 names = [name for name in re.split(r",\s*", line.partition(" :")[0]) if name in fields]
-                found.update((name, []) for name in names)
+                lines_of.update((name, []) for name in names)
             else:
                 for name in names:
-                    found[name].append(line.strip())
-    return {name: " ".join(lines).strip() for name, lines in found.items()}
+                    lines_of[name].append(line.strip())
+    return {name: " ".join(lines).strip() for name, lines in lines_of.items()}
 
 
 def write_settings(settings: Mapping[str, Settings]) -> str:
-    """Settings as a file that `read` takes: every field with its sentence."""
+    """Write settings as text that `read_settings` reads: every field with its description."""
     kept = _of_files(settings)
     return "\n\n".join("\n".join(_lines(config, (name,) if len(kept) > 1 else ())) for name, config in kept.items())
 
 
 def _of_files(settings: Mapping[str, Settings]) -> dict[str, Settings]:
-    """Those of which something has no flag."""
+    """Return the settings of which some field has no flag."""
     return {name: config for name, config in settings.items()
             if any(FLAG not in marks(hint) for hint in _hints(type(config)).values())}
 
 
 def _hints(cls: type) -> dict[str, Any]:
+    """Return the types of fields with their marks."""
     return typing.get_type_hints(cls, include_extras=True)
 
 
 def comment(text: str) -> str:
-    """Paragraphs as comment lines of a file, with an empty line after them; nothing for no text."""
+    """Format paragraphs as comment lines of a file, with an empty line after them; nothing for no text."""
     parts = [textwrap.fill(part, 102, initial_indent="# ", subsequent_indent="# ")
              for part in text.split("\n\n") if part]
     return "\n#\n".join(parts) + "\n\n" * bool(parts)
 
 
 def _lines(config: Any, table: Path_) -> Iterator[str]:
-    """Fields first, then tables, as TOML wants it."""
+    """Yield the lines of one group of settings: fields first, then tables, as TOML requires."""
     import tomlkit
 
-    told, inner = settings_sentences(type(config)), []
+    sentences, inner = settings_sentences(type(config)), []
     if table:
         yield f"[{'.'.join(table)}]"
     for field in dataclasses.fields(config):
@@ -111,13 +113,14 @@ def _lines(config: Any, table: Path_) -> Iterator[str]:
             inner.append((value, (*table, field.name)))
             continue
         if isinstance(value, tuple) and value and dataclasses.is_dataclass(value[0]):
+            # a tuple of settings becomes an array of inline tables
             rows = [", ".join(f"{f.name} = {tomlkit.item(getattr(item, f.name)).as_string()}"
                               for f in dataclasses.fields(item) if getattr(item, f.name) is not None) for item in value]
             text: str | None = "[" + ", ".join("{" + row + "}" for row in rows) + "]"
         else:
             text = None if value is None else tomlkit.item(list(value) if isinstance(value, tuple) else value
                                                           ).as_string()
-        yield from (f"# {line}" for line in textwrap.wrap(told.get(field.name, ""), 100))
+        yield from (f"# {line}" for line in textwrap.wrap(sentences.get(field.name, ""), 100))
         yield f"# {field.name} = (not set)" if text is None else f"{field.name} = {text}"
     for value, name in inner:
         yield ""
@@ -125,14 +128,14 @@ def _lines(config: Any, table: Path_) -> Iterator[str]:
 
 
 def read_settings(path: Path, settings: Mapping[str, Settings]) -> dict[str, Settings]:
-    """Settings with what a file changes in them; ValueError names file, line, what was expected, the nearest name."""
+    """Read settings from a file; ValueError names file, line, what was expected and the most similar name."""
     with storage.taking_apart(path, "settings in TOML"):
         text = storage.read_bytes(path, "settings in TOML").decode("utf-8")
     return parse_settings(text, path, settings)
 
 
 def parse_settings(text: str, path: Path, settings: Mapping[str, Settings]) -> dict[str, Settings]:
-    """The same of a text that stands in a file."""
+    """Parse settings from the text of a file."""
     import tomlkit
     from tomlkit.exceptions import ParseError
 
@@ -141,34 +144,36 @@ def parse_settings(text: str, path: Path, settings: Mapping[str, Settings]) -> d
     except ParseError as error:
         raise ValueError(f"{path}:{error.line}: expected TOML: {error}") from None
     place = _Place(path, text)
-    kept = _of_files(settings)
-    if len(kept) == 1:
-        name, config = next(iter(kept.items()))
+    in_file = _of_files(settings)
+    if len(in_file) == 1:
+        name, config = next(iter(in_file.items()))
         return {**settings, name: _apply_table(config, tree, (), place)}
     for name in tree:
-        place.check_name(name, kept, (), "table")
-    changed = {name: _apply_table(config, tree.get(name, {}), (name,), place) for name, config in kept.items()}
+        place.check_name(name, in_file, (), "table")
+    changed = {name: _apply_table(config, tree.get(name, {}), (name,), place) for name, config in in_file.items()}
     return {**settings, **changed}
 
 
 @dataclasses.dataclass(frozen=True)
 class _Place:
-    """Where in a file something is wrong."""
+    """The file and its text, to say where something is wrong."""
 
     path: Path
     text: str
 
     def error(self, name: str, table: Path_, problem: str) -> ValueError:
+        """Return the error for a key, with its line."""
         return ValueError(f"{self.path}:{self._line(name, table)}: {'.'.join((*table, name))}: {problem}")
 
     def check_name(self, name: str, known: Any, table: Path_, what: str) -> None:
+        """Raise an error for an unknown name, with the most similar known one."""
         if name not in known:
             near = difflib.get_close_matches(name, list(known), 1, 0.5)
             names = f"; did you mean {near[0]}?" if near else f"; there are: {', '.join(known)}"
             raise self.error(name, table, f"expected a {what} of this command{names}")
 
     def _line(self, name: str, table: Path_) -> int:
-        """The line of a key in a table, or of the table itself."""
+        """Find the line of a key in a table, or of the table itself."""
         at: Path_ = ()
         for i, line in enumerate(self.text.splitlines(), 1):
             if header := re.match(r"\s*\[+([^\]]+)\]", line):
@@ -183,7 +188,7 @@ class _Place:
 
 
 def _apply_table(config: Settings, tree: Any, table: Path_, place: _Place) -> Settings:
-    """Settings with the values of a table."""
+    """Return settings with the values of a table in the file."""
     import msgspec
 
     if not isinstance(tree, dict):
@@ -192,7 +197,7 @@ def _apply_table(config: Settings, tree: Any, table: Path_, place: _Place) -> Se
     for name, value in tree.items():
         place.check_name(name, names, table, "setting")
         now = getattr(config, name)
-        # a field that may hold settings, or None, begins with the default ones
+        # an optional group of settings that is None starts from its defaults
         options = typing.get_args(hints[name]) if typing.get_origin(hints[name]) in (typing.Union, types.UnionType) \
             else ()
         inner = now if isinstance(now, Settings) else next(
@@ -201,7 +206,7 @@ def _apply_table(config: Settings, tree: Any, table: Path_, place: _Place) -> Se
             new = msgspec.convert(value, hints[name]) if inner is None else \
                 _apply_table(inner, value, (*table, name), place)
             config = dataclasses.replace(config, **{name: new})
-        except OutOfRange as error:
+        except OutOfRangeError as error:
             raise place.error(name, table, error.args[1]) from None
         except msgspec.ValidationError as error:
             raise place.error(name, table, str(error).replace("`", "").replace("$", "value")) from None

@@ -1,4 +1,4 @@
-"""What a command tells: progress bars, notes, the closing table of its figures, and `report.json`."""
+"""What a command prints: progress bars, notes, the closing table of figures; and `report.json`."""
 from __future__ import annotations
 
 import contextlib
@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-if TYPE_CHECKING:               # imported where it is used: help answers at once
+if TYPE_CHECKING:               # imported where used, so that help answers at once
     from .batch.workspace import Workspace
     from .judgement import Judgement
 
@@ -23,7 +23,7 @@ Progress = Callable[[int, int], None]
 
 @dataclasses.dataclass(frozen=True)
 class Metric:
-    """One row of the closing table; a `detail` stands in the page and in report.json only."""
+    """One row of the closing table; a `detail` is shown only on the page and in report.json."""
 
     name: str
     value: float | int | str
@@ -31,7 +31,7 @@ class Metric:
     detail: bool = False
 
     def text(self) -> str:
-        """The value as printed: three significant digits for a fraction, "none" where there is no value."""
+        """Format the value: three significant digits for a fraction, "none" where there is no value."""
         if isinstance(self.value, float) and not math.isfinite(self.value):
             return "none"
         if isinstance(self.value, float):
@@ -41,10 +41,10 @@ class Metric:
 
 @dataclasses.dataclass(frozen=True)
 class Outcome:
-    """What a command did: where it wrote, the figures, and what failed on the way.
+    """The result of a command: where it wrote, its figures, and what failed on the way.
 
-    `judgement` says what the result is worth; the files are there whatever it says. None is for commands that make
-    none, and show or write down only what a user does. `following` is what to do next, in one sentence.
+    `judgement` says how good the result is; the files are written in any case. It is None for commands that compute
+    nothing, only show or record what the user does. `following` is the next step, in one sentence.
     """
 
     output: Path | None
@@ -56,20 +56,20 @@ class Outcome:
 
 
 def details(metrics: Iterable[Metric]) -> list[Metric]:
-    """The same rows for the page and report.json only."""
+    """Return the same rows, shown only on the page and in report.json."""
     return [dataclasses.replace(m, detail=True) for m in metrics]
 
 
-JUDGEMENT = "judgement"              # name of the row of figures that says what they are worth
+JUDGEMENT = "judgement"              # name of the row that says how good the result is
 
 
 def judgement_row(judgement: Judgement) -> Metric:
-    """The row of the closing table that says what the result is worth."""
+    """Return the row of the closing table that says how good the result is."""
     return Metric(JUDGEMENT, str(judgement))
 
 
 def judgement_of(metrics: Iterable[Metric]) -> Judgement | None:
-    """What a result is worth, where its figures say so."""
+    """Read the judgement from the rows of a result; None where they have none."""
     from .judgement import Judgement
 
     return next((Judgement.read(str(m.value)) for m in metrics if m.name == JUDGEMENT), None)
@@ -77,9 +77,9 @@ def judgement_of(metrics: Iterable[Metric]) -> Judgement | None:
 
 @contextlib.contextmanager
 def bar(what: str) -> Iterator[Progress]:
-    """A progress bar on standard error that appears with its first news; yields the callback that moves it.
+    """Show a progress bar on standard error, from its first call on; yield the callback that moves it.
 
-    Bars that are open at the same time stand below each other.
+    Bars that are open at the same time are below each other.
     """
     from rich import progress
     from rich.console import Console
@@ -94,40 +94,40 @@ def bar(what: str) -> Iterator[Progress]:
         shown = _open_displays[-1]
         task = shown.add_task(visible(what), total=None, start=False, visible=False)
 
-        def tell(done: int, total: int) -> None:
+        def report_progress(done: int, total: int) -> None:
             shown.start_task(task)
             shown.update(task, completed=done, total=total, visible=True)
 
-        yield tell
+        yield report_progress
 
 
-_open_displays: list[Any] = []
+_open_displays: list[Any] = []       # the display that bars share, while one is open
 
 
 def visible(text: str) -> str:
-    """Text fit for a terminal: characters that steer it, as names of files may hold, are written as `\\x1b`.
+    """Make text fit for a terminal: control characters, as in file names, are written as `\\x1b`.
 
     Line breaks stay.
     """
-    # categories that are no text: control, format (also what turns the direction), lone surrogates, separators
+    # Unicode categories without a visible form: control, format (also writing direction), surrogates, separators
     return "".join(c if c == "\n" or unicodedata.category(c) not in {"Cc", "Cf", "Cs", "Zl", "Zp"} else
                    c.encode("unicode_escape", "surrogatepass").decode("ascii") for c in text)
 
 
 def split_figures(metrics: Iterable[Metric]) -> tuple[list[Metric], list[Metric]]:
-    """The rows that the closing table shows, in order and at most twelve, as are read at a glance, and the rest."""
+    """Split rows into those of the closing table, at most twelve, as many as one reads at a glance, and the rest."""
     metrics = list(metrics)
     main = [m for m in metrics if not m.detail][:12]
     return main, [m for m in metrics if m not in main]
 
 
 def say(text: str) -> None:
-    """A line on standard error, for what a user should know while a command runs."""
+    """Print a line on standard error."""
     sys.stderr.write(visible(text) + "\n")
 
 
 def show(metrics: list[Metric]) -> None:
-    """Print the closing table of figure, value, unit: what comes first, and how many more there are."""
+    """Print the closing table of figure, value and unit, and how many more figures there are."""
     from rich.console import Console
     from rich.table import Table
     from rich.text import Text
@@ -135,7 +135,7 @@ def show(metrics: list[Metric]) -> None:
     table = Table("figure", "value", "unit")
     table.columns[1].justify = "right"
     main, more = split_figures(metrics)
-    for metric in main:          # as text: names may hold what rich takes for markup
+    for metric in main:          # as plain text: rich would read [brackets] in names as markup
         table.add_row(*(Text(visible(cell)) for cell in (metric.name, metric.text(), metric.unit)))
     if more:
         table.caption = f"{len(more)} more in report.json"
@@ -143,18 +143,20 @@ def show(metrics: list[Metric]) -> None:
 
 
 def library_versions() -> dict[str, str]:
-    """Versions of Python, the platform and the libraries the figures depend on."""
-    found = {"python": platform.python_version(), "machine": f"{platform.machine()}, {os.cpu_count()} cores"}
+    """Return the versions of Python, the platform and the libraries that figures depend on."""
+    versions = {"python": platform.python_version(), "machine": f"{platform.machine()}, {os.cpu_count()} cores"}
     for name in ("scapekit", "numpy", "scipy", "libigl", "cholespy", "embreex"):
         with contextlib.suppress(importlib.metadata.PackageNotFoundError):
-            found[name] = importlib.metadata.version(name)
-    return found
+            versions[name] = importlib.metadata.version(name)
+    return versions
 
 
 def write_report(outcome: Outcome, command: str, seconds: float, notes: Sequence[str] = (),
                  written: Mapping[str, str] | None = None) -> Path | None:
-    """Write `report.json` beside the output: command, settings, versions, figures, what was noticed on the way, and
-    digests of all files written."""
+    """Write `report.json` beside the output; return its path, or None without output.
+
+    It holds command, settings, versions, figures, notes and the digests of all files written.
+    """
     from .batch.ownership import report_path
     from .geometry import storage
 
@@ -171,7 +173,7 @@ def write_report(outcome: Outcome, command: str, seconds: float, notes: Sequence
 
 
 def keep_report(space: Workspace, outcome: Outcome, command: str, seconds: float, notes: Sequence[str] = ()) -> Path:
-    """`write_report` for an output folder that is open; its path."""
+    """Write the report of an open output folder; return its path."""
     with space.staging("report") as staged:
         write_report(dataclasses.replace(outcome, output=staged.folder), command, seconds, notes)
     return space.folder / "report.json"

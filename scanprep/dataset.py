@@ -1,4 +1,4 @@
-"""The registered set: a folder of meshes in one topology, handed over from `scanprep` to `model`."""
+"""The registered set: a folder of meshes in one topology, which `scanprep` writes and `model` learns from."""
 from __future__ import annotations
 
 import re
@@ -14,21 +14,23 @@ from .geometry.files import MeshFileError, check_same_topology, read_mesh, write
 from .geometry.mesh import Mesh
 from .skeleton.tree import Skeleton
 
+# version and kind in the header, `set.json`: files of another version are refused
 VERSION = 1
 KIND = "registered set"
 
 
 @dataclass(frozen=True)
 class SetEntry:
-    """One registered mesh: a row of `set.csv`; empty what is not known."""
+    """One registered mesh: a row of `set.csv`; empty where something is not known."""
 
-    name: str               # its own in the set, and the name of its file
+    name: str               # unique in the set, and the name of its file
     subject: str = ""
     pose: str = ""
     sex: str = ""
-    file: str = ""          # path inside the folder
+    file: str = ""          # path inside the folder of the set
 
 
+# columns of `set.csv`
 _COLUMNS = [f.name for f in fields(SetEntry)]
 
 
@@ -36,18 +38,32 @@ _COLUMNS = [f.name for f in fields(SetEntry)]
 class RegisteredSet:
     """A folder of registered meshes: `template.ply`, `meshes/*.ply`, `set.csv`, `skeleton.json`, `set.json`.
 
-    Every change is on disk when the method returns, whole or not at all, so that work that was interrupted
-    can go on; the set at hand is never changed, the new one is returned.
+    Every change is on disk when the method returns, completely or not at all, so that interrupted work can be resumed.
+    The object itself never changes: methods return the new set.
 
-    Attributes
+    Parameters
     ----------
     folder : Path
+        Folder of the set.
     template : Mesh
+        The mesh that was registered to the scans.
     entries : tuple of SetEntry
-        In the order in which they were added.
-    skeleton : Skeleton or None
+        The registered meshes, in the order in which they were added.
+    skeleton : Skeleton, optional
+        Parts and joints of the template.
     info : dict
         What else `set.json` says.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> from scanprep import RegisteredSet
+    >>> from scanprep.synthetic.people import SyntheticPerson
+    >>> person = SyntheticPerson()
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     registered = RegisteredSet.create(folder, person.mesh).add("anna", person.mesh, subject="anna")
+    ...     registered.names, registered.shapes().shape == (1, *person.mesh.vertices.shape)
+    (('anna',), True)
     """
 
     folder: Path
@@ -61,13 +77,30 @@ class RegisteredSet:
 
     @staticmethod
     def create(folder: str | Path, template: Mesh, info: dict[str, Any] | None = None) -> RegisteredSet:
-        """Begin a set, or go on with the one in the folder; `info`, values of JSON, is kept in `set.json`.
+        """Create a set, or open the one in the folder.
 
-        ValueError where the folder holds a set of another template.
+        Parameters
+        ----------
+        folder : str or Path
+            Folder of the set.
+        template : Mesh
+            The mesh that is registered to the scans.
+        info : dict, optional
+            Values for JSON, kept in `set.json`.
+
+        Returns
+        -------
+        RegisteredSet
+
+        Raises
+        ------
+        ValueError
+            The folder holds a set with another template.
         """
         folder = Path(folder)
         if (folder / "set.json").exists():
             old = RegisteredSet.load(folder)
+            # a micrometre apart is still the same template: files hold single precision
             if not (np.array_equal(old.template.faces, template.faces)
                     and np.allclose(old.template.vertices, template.vertices, rtol=0, atol=1e-6)):
                 raise ValueError(f"folder: {folder} holds a set of another template, {old.template}; "
@@ -78,9 +111,21 @@ class RegisteredSet:
 
     @staticmethod
     def load(folder: str | Path) -> RegisteredSet:
-        """Read a set; its meshes stay on disk until they are asked for.
+        """Read a set; its meshes stay on disk until they are needed.
 
-        MeshFileError or StorageError, which names the file, for one that is missing, damaged or of an unknown version.
+        Parameters
+        ----------
+        folder : str or Path
+            Folder of the set.
+
+        Returns
+        -------
+        RegisteredSet
+
+        Raises
+        ------
+        MeshFileError, StorageError
+            A file is missing, damaged or of an unknown version; the message names it.
         """
         folder = Path(folder)
         info = _read_header(folder)
@@ -101,14 +146,25 @@ class RegisteredSet:
         Parameters
         ----------
         name : str
-            One that can be a file: no dot in front and none of `<>:"/\\|?*`.
+            A valid file name: no dot in front and none of `<>:"/\\|?*`.
         mesh : Mesh or (N, 3) float, metres
-            In the topology of the template.
+            Mesh in the topology of the template, or its vertices.
+        subject : str
+            Whose scan it is.
+        pose : str
+            Name of the pose.
+        sex : str
+            "female", "male" or unknown.
+
+        Returns
+        -------
+        RegisteredSet
+            The set with the mesh.
 
         Raises
         ------
         ValueError
-            A name that cannot be a file, or a mesh of another topology.
+            The name cannot be a file name, or the mesh has another topology.
         """
         if not re.fullmatch(r"[^.<>:\"/\\|?*\x00-\x1f][^<>:\"/\\|?*\x00-\x1f]*", name):
             raise ValueError(f"name: expected one that can be a file, without a dot in front, got {name!r}")
@@ -120,12 +176,28 @@ class RegisteredSet:
         entry = SetEntry(name, subject, pose, sex, f"meshes/{name}.ply")
         write_mesh(self.folder / entry.file, mesh)
         rows = {row.name: row for row in read_entries(self.folder)}
-        rows[name] = entry                               # in the place of the old one, if there was one
+        rows[name] = entry                               # replaces an entry of the same name in its place
         _write_rows(self.folder, rows.values())
         return replace(self, entries=tuple(rows.values()))
 
     def with_skeleton(self, skeleton: Skeleton) -> RegisteredSet:
-        """Write a skeleton into the set; ValueError for one of another triangulation."""
+        """Write a skeleton into the set.
+
+        Parameters
+        ----------
+        skeleton : Skeleton
+            Parts and joints of the template.
+
+        Returns
+        -------
+        RegisteredSet
+            The set with the skeleton.
+
+        Raises
+        ------
+        ValueError
+            The skeleton is of another triangulation.
+        """
         if len(skeleton.part_of_face) != len(self.template.faces):
             raise ValueError(f"skeleton: expected {len(self.template.faces)} faces as the template has, "
                              f"got {len(skeleton.part_of_face)}")
@@ -134,7 +206,7 @@ class RegisteredSet:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """The names of all meshes."""
+        """Names of all meshes."""
         return tuple(entry.name for entry in self.entries)
 
     @property
@@ -143,9 +215,23 @@ class RegisteredSet:
         return tuple(dict.fromkeys(entry.subject for entry in self.entries))
 
     def vertices(self, names: Sequence[str] | None = None) -> np.ndarray:
-        """Vertices (M, N, 3), metres, of the meshes of these names, or of all.
+        """Read the vertices of meshes.
 
-        MeshFileError for a mesh that is missing, damaged or of another topology, ValueError for an unknown name.
+        Parameters
+        ----------
+        names : sequence of str, optional
+            Which meshes; by default all.
+
+        Returns
+        -------
+        (M, N, 3) float, metres
+
+        Raises
+        ------
+        MeshFileError
+            A mesh is missing, damaged or of another topology.
+        ValueError
+            An unknown name.
         """
         by_name = {entry.name: entry for entry in self.entries}
         unknown = [name for name in names or () if name not in by_name]
@@ -160,7 +246,22 @@ class RegisteredSet:
         return out
 
     def poses(self, subject: str | None = None) -> np.ndarray:
-        """Vertices (M, N, 3), metres, of all meshes of a subject, by default of the one with the most."""
+        """Read the vertices of all meshes of one subject.
+
+        Parameters
+        ----------
+        subject : str, optional
+            By default the subject with the most meshes.
+
+        Returns
+        -------
+        (M, N, 3) float, metres
+
+        Raises
+        ------
+        ValueError
+            An unknown subject, or an empty set.
+        """
         if not self.entries:
             raise ValueError(f"{self.folder}: the set holds no meshes")
         count = [entry.subject for entry in self.entries].count
@@ -170,21 +271,27 @@ class RegisteredSet:
         return self.vertices([entry.name for entry in self.entries if entry.subject == wanted])
 
     def shapes(self) -> np.ndarray:
-        """Vertices (S, N, 3), metres, of one mesh of every subject: the one that was added first."""
+        """Read the vertices of one mesh of every subject, the one that was added first.
+
+        Returns
+        -------
+        (S, N, 3) float, metres
+        """
         first = {entry.subject: entry.name for entry in reversed(self.entries)}
         return self.vertices([first[subject] for subject in self.subjects])
 
 
 def write_set(folder: Path, template: Mesh, entries: Sequence[SetEntry], info: dict[str, Any] | None = None) -> None:
-    """Write all of a set but its meshes and skeleton."""
+    """Write everything of a set but its meshes and skeleton."""
     write_mesh(folder / "template.ply", template)
     _write_rows(folder, entries)
     header = {"kind": KIND, "version": VERSION, "vertices": len(template.vertices), "faces": len(template.faces),
               **(info or {})}
-    storage.write_json(folder / "set.json", header)              # last: with it the set exists
+    storage.write_json(folder / "set.json", header)              # last: a folder with this file is a complete set
 
 
 def _read_header(folder: Path) -> dict[str, Any]:
+    """Read `set.json`; StorageError for another kind of file or an unknown version."""
     path = folder / "set.json"
     info = storage.read_json(path, "the header of a registered set")
     if not isinstance(info, dict) or info.pop("kind", None) != KIND or not {"vertices", "faces"} <= set(info):
@@ -197,15 +304,15 @@ def _read_header(folder: Path) -> dict[str, Any]:
 
 
 def read_entries(folder: Path, being_made: Collection[str] = ()) -> tuple[SetEntry, ...]:
-    """The rows of `set.csv`; files of names that are `being_made` may be gone.
+    """Read the rows of `set.csv`; mesh files of the names in `being_made` may be missing.
 
-    StorageError, which names the line, for a file that is missing, outside the folder, or a name that comes twice.
+    StorageError, which names the line, for a missing file, one outside the folder, or a name that occurs twice.
     """
     path = folder / "set.csv"
     entries: dict[str, SetEntry] = {}
     for line, row in tables.read_table(path, _COLUMNS, ("name", "file")):
         entry = SetEntry(**{column: row[column] for column in _COLUMNS})
-        storage.path_inside(folder, entry.name, f"{path}: line {line}")       # files of other folders are called so
+        storage.path_inside(folder, entry.name, f"{path}: line {line}")       # the name also names files elsewhere
         place = storage.path_inside(folder, entry.file, f"{path}: line {line}")
         if not place.is_file() and entry.name not in being_made:
             raise storage.StorageError(f"{path}: line {line}: there is no file {entry.file}")
@@ -216,4 +323,5 @@ def read_entries(folder: Path, being_made: Collection[str] = ()) -> tuple[SetEnt
 
 
 def _write_rows(folder: Path, rows: Iterable[SetEntry]) -> None:
+    """Write `set.csv`."""
     tables.write_table(folder / "set.csv", _COLUMNS, map(astuple, rows))

@@ -1,8 +1,8 @@
-"""Commands that work through many things, each into a folder of its own: what is told of all, and mended again.
+"""Commands that process many things, each into a folder of its own, with one page and report about all.
 
     OUTPUT/NAME/...               one of them: its files, its page, its report
     OUTPUT/report.html            all of them, worst first
-    OUTPUT/.scapekit/run.json     what the command was called with, where results can be mended
+    OUTPUT/.scapekit/run.json     the call of the command, where results can be corrected
 """
 from __future__ import annotations
 
@@ -24,32 +24,32 @@ from .pictures.scene import SCENE, worst_that_turn
 from .pictures.sheets import small_picture
 from .words import number_of
 
-PAGE = "page"                        # name of the result that keeps what failed, beside the page
-PICTURE = "picture.png"              # of one of the things, in its folder
+PAGE = "page"                        # name of the result that keeps the failures, with the page
+PICTURE = "picture.png"              # picture of one thing, in its folder
 
 
 @dataclass(frozen=True)
 class FolderCommand:
-    """What a command tells of the things that it works through.
+    """How a command reports about the things that it processes.
 
     Attributes
     ----------
     things : tuple of str
-        One of them, and several where that is no s at the end.
+        The singular, and the plural where it is not formed with s.
     title : str
-        Of the page; {} stands for the number of things.
+        Title of the page; {} stands for the number of things.
     figures : callable
-        The rows of the closing table, from the results and how many things there are.
+        Returns the rows of the closing table from the results and the number of things.
     error : callable
-        From the rows of one: of those with the same verdict the one with the largest comes first.
+        Returns a number from the rows of one thing: the largest come first among equal verdicts.
     settings : mapping
         For the report.
     lines : callable, optional
-        What the page says of one, from its name and rows.
+        Returns what the page says of one thing, from its name and rows.
     hint : str
-        What the page says of all.
+        What the page says about all.
     call : KeptCall, optional
-        What the command was called with, where results can be mended.
+        The call of the command, where results can be corrected.
     """
 
     things: tuple[str, ...]
@@ -62,16 +62,15 @@ class FolderCommand:
     call: KeptCall | None = None
 
     def carry_out(self, doing: str, space: Workspace, work: Any, tasks: Sequence[Task], workers: Workers) -> Outcome:
-        """Work through the things, with a bar that says what is done, and write of all."""
+        """Process the things, with a progress bar, and write the page about all."""
         with bar(doing) as progress:
             results = space.run(work, tasks, workers, progress)
         return self.write(space, results, len(tasks))
 
-
     def write(self, space: Workspace, results: Results, count: int, failed: Sequence[str] = ()) -> Outcome:
-        """The page of results in an output that is open, and what was called there; what is told of so many things.
+        """Write the page and the call into an open output; return the outcome for `count` things.
 
-        `failed` are lines on what failed within results that were made.
+        `failed` are lines about failures within results that exist.
         """
         outcome = self.outcome(space, results, count, failed)
         with space.staging(PAGE) as staged:
@@ -82,7 +81,7 @@ class FolderCommand:
         return outcome
 
     def outcome(self, space: Workspace, results: Results, count: int, failed: Sequence[str] = ()) -> Outcome:
-        """What is told of so many things."""
+        """Return the outcome for `count` things."""
         judged = {name: judgement_of(rows) or Judgement() for name, rows in results.values.items()}
         worthless = [f"{name}: {one.why}" for name, one in judged.items() if one.problems]
         return Outcome(space.folder, self.figures(results, count), self.settings,
@@ -90,7 +89,7 @@ class FolderCommand:
                        judgement=judge_many(judged, len(results.failures)))
 
     def page(self, results: Results, failures: Sequence[str], folder: Path) -> Page:
-        """All results, worst first, each with the way to its own page in the folder."""
+        """Build the page of all results, worst first, each with a link to its own page."""
         page = Page(self.title.format(number_of(len(results.values), *self.things)),
                     f"Worst first; each name leads to the page of its {self.things[0]}.").text(self.hint)
         if failures:
@@ -104,8 +103,9 @@ class FolderCommand:
         return page
 
     def worst_first(self, results: Results, names: Iterable[str]) -> list[str]:
-        """Failures first, then by verdict and error; at the end what was not done yet."""
+        """Sort names: failures first, then by verdict and error, last what was not done yet."""
         def gravity(name: str) -> tuple[int, float, str]:
+            """Return the sort key of one thing."""
             judgement = judgement_on(name, results)
             error = self.error(results.values[name]) if name in results.values else np.inf
             return (("failed", "check", "good", "new").index("new" if judgement is None else judgement.verdict),
@@ -115,33 +115,33 @@ class FolderCommand:
 
 
 def do_one(doing: str, space: Workspace, work: Any, task: Task, settings: Mapping[str, Any], following: str) -> Outcome:
-    """One thing alone, into the output itself, where the work writes its page."""
+    """Process one thing alone, directly into the output, where the work writes its page."""
     with bar(doing) as progress:
         rows = space.run(work, [task], inside=progress).only
     return Outcome(space.folder, rows, settings, judgement=judgement_of(rows), following=following)
 
 
 def as_line(metric: Metric) -> str:
-    """A figure in words."""
+    """Return a figure as text."""
     return f"{metric.name}: {metric.text()} {metric.unit}"
 
 
 def figure(rows: Sequence[Metric], *names: str) -> float:
-    """The first figure of these names; 0 where there is none."""
+    """Return the first figure with one of these names; 0 where there is none."""
     return next((float(m.value) for m in rows if m.name in names), 0.0)
 
 
 def add_entry(page: Page, name: str, lines: Iterable[str], shown: str | None = None) -> None:
-    """One result, leading to its own page: what is said of it, and the HTML of what is shown, else its picture."""
+    """Add one result to the page, with a link to its own page; `shown` is HTML, by default its picture."""
     address = f"{link_to(name)}/report.html"
-    told = "".join(f"<p>{escape(line)}</p>" for line in lines)
+    text = "".join(f"<p>{escape(line)}</p>" for line in lines)
     if shown is None:
         shown = f'<a href="{address}"><img src="{link_to(name)}/{PICTURE}" alt="{escape(name)}"></a>'
-    page.markup(f'<div class="entry"><div><a href="{address}"><b>{escape(name)}</b></a>{told}</div>{shown}</div>')
+    page.markup(f'<div class="entry"><div><a href="{address}"><b>{escape(name)}</b></a>{text}</div>{shown}</div>')
 
 
 def load_results(space: Workspace, names: Sequence[str]) -> Results:
-    """What is known of things by their names, from a folder that need not be open."""
+    """Load results by name from an output that need not be open."""
     kept = set(space.list_results(""))
     failures = (space.value(PAGE) if PAGE in kept else None) or {}
     values = {name: space.value(name) for name in names if name in kept}
@@ -149,7 +149,7 @@ def load_results(space: Workspace, names: Sequence[str]) -> Results:
 
 
 def judgement_on(name: str, results: Results) -> Judgement | None:
-    """What one result is worth; None for what was not done yet."""
+    """Return the judgement on one result; None for what was not done yet."""
     if name in results.failures:
         return Judgement("failed", (results.failures[name],))
     return judgement_of(results.values[name]) or Judgement() if name in results.values else None

@@ -1,6 +1,6 @@
-"""Ranges of numbers that users choose: said once, beside the type, and checked in one place.
+"""Ranges of numbers that users choose: declared once, beside the type, and checked in one place.
 
-A number without a mark is finite and not negative. A mark stands in the annotation, as in `rate: Positive = 30.0`.
+A number without a mark must be finite and not negative. A mark is in the annotation, as in `rate: Positive = 30.0`.
 """
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from typing import Annotated, Any, get_args, get_type_hints
 
 import numpy as np
 
-FLAG = "flag"                           # marks a field of settings that is a flag of the command line too
-TINY, LARGE = 1e-12, 1e9                # nearer to 0, or larger, is no setting of anything: their squares overflow
+FLAG = "flag"                           # marks a field of settings that is also a command-line flag
+TINY, LARGE = 1e-12, 1e9                # no setting is closer to 0 or larger; squares could overflow
 
 
-class OutOfRange(ValueError):
-    """A number that a user chose is not in its range; its arguments are whose number, and what is wrong with it."""
+class OutOfRangeError(ValueError):
+    """A number that a user chose is out of range; its arguments are the name, and what is wrong."""
 
     def __str__(self) -> str:
         return ": ".join(self.args)
@@ -24,19 +24,19 @@ class OutOfRange(ValueError):
 
 @dataclasses.dataclass(frozen=True)
 class Range:
-    """From the lowest to the highest number that is allowed; NaN and infinity never are."""
+    """Lowest and highest allowed number; NaN and infinity are never allowed."""
 
     low: float = 0.0
     high: float = LARGE
 
     def check(self, value: Any, name: str) -> None:
-        """OutOfRange if the number, or one of a tuple or array of them, is outside; what is no number passes."""
+        """Raise OutOfRangeError if a number, or one in a tuple or array, is outside; other values pass."""
         if isinstance(value, np.ndarray):
             value = value[~((value >= self.low) & (value <= self.high))][:1].tolist()
         for part in value if isinstance(value, tuple | list) else ():
             self.check(part, name)
         if isinstance(value, int | float | np.number) and not self.low <= value <= self.high:
-            raise OutOfRange(name, f"expected {self}, got {value}")
+            raise OutOfRangeError(name, f"expected {self}, got {value}")
 
     def __str__(self) -> str:
         if self.low == TINY:
@@ -45,25 +45,25 @@ class Range:
 
 
 NOT_NEGATIVE = Range()
-BETAS = Range(-20, 20)          # standard deviations
-TURNS = Range(-1000, 1000)      # radians
+BETAS = Range(-20, 20)          # standard deviations: far beyond any person, so that experiments are possible
+TURNS = Range(-1000, 1000)      # radians: many turns, as recordings may count them on
 
 Positive = Annotated[float, Range(TINY)]
 Signed = Annotated[float, Range(-LARGE)]
 Share = Annotated[float, Range(0, 1)]
 SomeShare = Annotated[float, Range(TINY, 1)]
 Cosine = Annotated[float, Range(-1, 1)]
-Cell = Annotated[float, Range(1e-4, 1e3)]           # space is divided into pieces of this size
+Cell = Annotated[float, Range(1e-4, 1e3)]           # edge of cells that divide space, metres
 Beta = Annotated[float, BETAS]
 Count = Annotated[int, Range(1, 10_000_000)]
 Faces = Annotated[int, Range(4, 100_000_000)]
 Seed = Annotated[int, Range(0, 2**32 - 1)]
-Processes = Annotated[int | str, Range(0, 1000)]    # of this machine, or the address of others
+Processes = Annotated[int | str, Range(0, 1000)]    # number of processes, or the address of a scheduler
 
 
 @dataclasses.dataclass(frozen=True)
 class Settings:
-    """Base of settings: a frozen dataclass whose numbers are in their ranges, or it is not made."""
+    """Base of settings: a frozen dataclass that checks the ranges of its numbers when it is created."""
 
     def __post_init__(self) -> None:
         owner: Any = type(self)
@@ -73,17 +73,17 @@ class Settings:
 
 @functools.cache
 def ranges(owner: Any) -> dict[str, Range]:
-    """The range of every argument of a function or field of settings."""
+    """Return the range of every argument of a function, or field of settings."""
     return {name: range_of(annotation) for name, annotation in get_type_hints(owner, include_extras=True).items()}
 
 
 def range_of(annotation: Any) -> Range:
-    """The range that stands beside the type in an annotation."""
+    """Return the range beside the type in an annotation."""
     return next((mark for mark in marks(annotation) if isinstance(mark, Range)), NOT_NEGATIVE)
 
 
 def marks(annotation: Any) -> Iterator[Any]:
-    """What stands beside the types in an annotation, at any depth."""
+    """Yield everything beside the types in an annotation, at any depth."""
     yield from getattr(annotation, "__metadata__", ())
     for part in get_args(annotation):
         yield from marks(part)

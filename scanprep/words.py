@@ -1,11 +1,11 @@
-"""What messages for users are made of: numbers with their nouns, and the warnings that are notes for them."""
+"""Texts of messages for users: numbers with nouns, and the modules whose warnings are shown."""
 from __future__ import annotations
 
-OUR_MODULES = r"(scanprep|model|completion)(\.|$)"     # whose warnings are notes for users
+OUR_MODULES = r"(scanprep|model|completion)(\.|$)"     # modules whose warnings are notes for users
 
 
 def number_of(count: int, one: str, several: str = "") -> str:
-    """A count with its noun: the plural is the singular with an s where `several` does not say it.
+    """Return a count with its noun; the plural is `several`, by default the singular with an s.
 
     Examples
     --------

@@ -1,4 +1,4 @@
-"""The files that the READMEs name, in a folder of a user, and the commands and snippets that use them."""
+"""The files that the documents name, in a folder of a user, and the commands and snippets that use them."""
 import json
 import re
 import shlex
@@ -9,7 +9,8 @@ from unittest.mock import patch
 from urllib.parse import quote
 from urllib.request import urlopen
 
-import numpy as np
+import pytest
+from readme_user import of_a_user
 
 from completion import Motion, read_markers, write_markers
 from completion.__main__ import main
@@ -23,45 +24,94 @@ from scanprep.synthetic.data_set import read_views
 from scanprep.viewer import server
 
 ROOT = Path(__file__).parents[1]
-CHILD = 0.6                          # the size of the person in the range views: small ones are merged quickly
+README = "README.md"
+# Which documents each test file runs, in this order. Those of one file use what the commands before them wrote.
+PARTS = {
+    "start": (README, "index", "tasks/researcher", "tasks/anthropometrist"),
+    "scans": ("scanprep/README.md", "methods/registration", "methods/skeleton", "methods/scan-repair",
+              "methods/correspondence"),
+    "model": ("model/README.md", "methods/scape", "methods/other-models", "methods/learning-from-few-scans",
+              "methods/body-fit", "methods/coregistration", "methods/measurement", "methods/statues",
+              "methods/pytorch")}
+REST = "completion"                  # all other documents
+CHILD = 0.5                          # the size of the person in the range views: small ones are merged quickly
 OTHERS = 2500                        # triangles of meshes that others registered: a skeleton is sought on them
 SIDES = {0: "front", 4: "back"}      # two views of the grown person
-QUICKER = {"scape statue fit": ["--size", "512"]}            # added to a command that takes long
+SETTINGS = "quicker.toml"
+# added to commands that begin so and take long: words, or settings in a file
+QUICKER = {
+    "scape statue fit": "--size 512",
+    "scape prep skeleton": "restarts = 1",
+    "scape learn --poses set --shapes set --kind": "--skeleton set/skeleton.json"}       # that of README seeks one
+QUICK = "scape model mesh", "scape complete half_view.ply -m model.npz -o", "scape animate"      # a few seconds
 SET_UP = {"pip install . && scape demo", 'pip install ".[test]" && pytest'}
 
 
-def blocks(readme, kind):
-    """The texts of one kind, "bash" or "python", in a README."""
-    return re.findall(rf"```{kind}\n(.*?)```", (ROOT / readme).read_text(encoding="utf-8"), re.DOTALL)
+def documents(part):
+    """The documents of a part that exist, as paths from the root."""
+    pages = sorted((ROOT / ".docs" / "pages").rglob("*.md"))
+    everything = [README, *sorted(path.relative_to(ROOT).as_posix() for path in ROOT.glob("*/README.md")),
+                  *(path.relative_to(ROOT).as_posix() for path in pages)]
+    named = {one: [name if name.endswith(".md") else f".docs/pages/{name}.md" for name in names]
+             for one, names in PARTS.items()}
+    taken = {name for names in named.values() for name in names}
+    wanted = named[part] if part != REST else [name for name in everything if name not in taken]
+    return [name for name in wanted if name in everything]
 
 
-def commands(readme):
-    return [line for text in blocks(readme, "bash") for line in text.splitlines() if line]
+def blocks(document, kind):
+    """The texts of one kind, "bash" or "python", in a document."""
+    return re.findall(rf"```{kind}\n(.*?)```", (ROOT / document).read_text(encoding="utf-8"), re.DOTALL)
 
 
-def run_commands(readme):
-    """Every command of a README in its order, as each uses what the one before it wrote."""
-    wanted = [line for line in commands(readme) if line not in SET_UP]
-    assert wanted
-    for line in wanted:
-        words = shlex.split(line)
-        assert words[0] == "scape"
-        words = ["own.ply" if w == "template.ply" and "views" in words else w for w in words]    # it is there already
-        words += QUICKER.get(" ".join(words[:3]), [])
-        with patch.object(server, "serve", opened_once):
-            assert main(words[1:]) == 0, line
+def commands(document):
+    return [line for text in blocks(document, "bash") for line in text.splitlines() if line]
 
 
-def opened_once(app, *_given):
+def commands_of_part(part):
+    """Every command of a part in its order, each once. Those of README are run by the part that README is in."""
+    elsewhere = set() if README in documents(part) else set(commands(README))
+    lines = dict.fromkeys(line for document in documents(part) for line in commands(document))
+    return [line for line in lines if line not in SET_UP | elsewhere]
+
+
+def snippets_of_part(part):
+    """(document, code) of every Python snippet of a part, each once."""
+    found = {code: pytest.param(document, code, id=f"{document}-{i}") for document in reversed(documents(part))
+             for i, code in enumerate(blocks(document, "python"))}
+    return list(found.values())[::-1]
+
+
+def run_command(line):
+    """One command as a user writes it."""
+    words = shlex.split(line)
+    assert words[0] == "scape", line
+    words = ["own.ply" if w == "template.ply" and "views" in words else w for w in words]    # it is there already
+    more = next((more for begin, more in QUICKER.items() if line.startswith(begin)), "")
+    if "=" in more:
+        Path(SETTINGS).write_text(more + "\n")
+        more = f"--config {SETTINGS}"
+    words += more.split()
+    with patch.object(server, "serve", open_once):
+        assert main(words[1:]) == 0, line
+
+
+def run_snippet(document, code):
+    if "import torch" in code:
+        pytest.importorskip("torch")
+    exec(compile(code, document, "exec"), {})
+
+
+def open_once(app, *_given):
     """In place of a server that runs until Ctrl-C: one that a browser asks once for its page."""
     with server.Server(app) as running, urlopen(running.opening()) as answer:
         assert answer.status == 200 and b"scapekit.start" in answer.read()
 
 
-def user_folder(demo, folder):
+def user_folder(demo, folder, unregistered=2):
     """Ten scans, a template, a half view, a recording, frames of a walk, registered meshes, range views.
 
-    Eight of the scans are registered already, in a set that is not finished. From six of these scans comes a model
+    All scans but some are registered already, in a set that is not finished. From six of these scans comes a model
     that loses a shin of the half view, and says so.
     """
     shutil.copytree(demo, folder / "scape_demo")
@@ -101,7 +151,8 @@ def user_folder(demo, folder):
         for row in rows:
             name = row.split(",")[0]
             write_mesh(folder / "registered" / part / f"{name}.ply", small.template.with_vertices(bodies[name]))
-    begun_set(demo / "set", folder / "set", [row.split(",")[0] for row in [*mine[:6], *mine[7:], others[0]]])
+    rows = [*mine[:6], *mine[7:], others[0], mine[6], others[1]]             # the last of them to be registered
+    begun_set(demo / "set", folder / "set", [row.split(",")[0] for row in rows[:len(rows) - unregistered]])
     return folder
 
 
@@ -118,13 +169,25 @@ def begun_set(demo, folder, names):
             shutil.copy(demo / file, folder / file)
 
 
+def keep_scans(folder, names):
+    """Remove the other scans, so that a command of the whole folder is quick."""
+    rows = (folder / "scans" / "scans.csv").read_text().splitlines()
+    kept = [row for row in rows[1:] if row.split(",")[0] in names]
+    assert len(kept) == len(names)
+    (folder / "scans" / "scans.csv").write_text("\n".join([rows[0], *kept]) + "\n")
+    for row in rows[1:]:
+        if row not in kept:
+            for ending in (".ply", ".landmarks.json"):
+                (folder / "scans" / (row.split(",")[0] + ending)).unlink()
+
+
 def with_demo_model(folder):
-    """The model of the demonstration, which learned from more scans than a user has, and what was made with it."""
+    """What the commands of README write: set and model are the demonstration's, which has more scans than a user."""
     demo = folder / "scape_demo"
     shutil.copy(demo / "model.npz", folder / "model.npz")
-    model = load_model(demo / "model.npz")
-    standing = np.zeros((len(model.skeleton.parents), 3))
-    write_mesh(folder / "heavier.ply", model.template.with_vertices(model.vertices(standing, np.array([1.5]))))
-    (folder / "walk").mkdir(exist_ok=True)
-    shutil.copy(demo / "animation" / "motion.npz", folder / "walk")
+    shutil.copytree(demo / "set", folder / "set", dirs_exist_ok=True)
+    with of_a_user(folder):
+        for line in commands(README):
+            if line.startswith(QUICK):
+                run_command(line)
     return folder

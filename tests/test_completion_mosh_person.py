@@ -12,8 +12,14 @@ from completion.mocap.mosh.mosh import PoseConfig
 from completion.mocap.pose.judgement import distrusted_marker_warnings, markers_told
 from completion.mocap.pose.marked_body import AnimateConfig
 from completion.mocap.subject.attachment import latent_markers
+from completion.mocap.subject.misplaced_markers import (
+    MisplacedMarkers,
+    MovedMarker,
+    _Frames,
+    _with_whole_parts,
+    find_misplaced_markers,
+)
 from completion.mocap.subject.person import choose_frames, common_markers, judge_moves, spread_frames
-from completion.mocap.subject.worn_elsewhere import MovedMarker, Worn, _Frames, _with_whole_parts, find_worn
 from scanprep.geometry import rotations
 from scanprep.geometry.surface import Surface
 from scanprep.judgement import Judgement
@@ -263,7 +269,7 @@ def test_a_marker_worn_elsewhere_and_a_pair_of_exchanged_names_are_put_right():
     moved = np.array(displaced())
     moved[3] = moved[15]                                        # half a metre along the worm, beside another marker
     found = worn_otherwise(3, sequence(displaced()).positions[:, 15], [(6, 20)])
-    assert [m.label for m in found.worn.moved] == ["M03"] and found.worn.exchanged == (("M06", "M20"),)
+    assert [m.label for m in found.misplaced.moved] == ["M03"] and found.misplaced.exchanged == (("M06", "M20"),)
     rows = [LABELS.index(label) for label in found.layout.labels]
     off = np.linalg.norm(rest_places(found.layout, found.betas) - moved[rows], axis=1)
     assert off[found.layout.labels.index("M03")] < 0.01 and off.max() < 0.04
@@ -278,8 +284,8 @@ def test_a_marker_that_no_place_of_the_skin_explains_is_told_and_left_out():
     floating = np.array(displaced())
     floating[3] += [0.0, 0.0, 0.3]
     found = worn_otherwise(3, sequence(floating).positions[:, 3])
-    assert found.worn.unplaced == ("M03",) and not found.worn.moved and not found.worn.exchanged
-    assert "M03" not in found.layout.labels and "M03" in found.worn.judgement(found.layout.labels).doubts[0]
+    assert found.misplaced.unplaced == ("M03",) and not found.misplaced.moved and not found.misplaced.exchanged
+    assert "M03" not in found.layout.labels and "M03" in found.misplaced.judgement(found.layout.labels).doubts[0]
     assert np.nanmean(found.motions[0].residuals) < 5e-3
     np.testing.assert_allclose(found.betas, beside().betas, atol=0.35)
 
@@ -291,7 +297,7 @@ def test_a_part_keeps_its_markers(share, verdict):
     part = at.part[LAYOUT.nearest]
     mine = np.array(LABELS)[part == part[0]]
     gone = tuple(mine[:round(share * len(mine))].tolist())
-    found = _with_whole_parts(at, Worn(unplaced=(*gone, LABELS[-1])), MODEL.skeleton.names)
+    found = _with_whole_parts(at, MisplacedMarkers(unplaced=(*gone, LABELS[-1])), MODEL.skeleton.names)
     (told,) = found.lost
     assert found.unplaced == (LABELS[-1],) and told == (MODEL.skeleton.names[part[0]], gone, verdict == "all")
     judgement = found.judgement(LABELS)
@@ -316,7 +322,7 @@ def test_left_and_right_exchanged_on_many_markers_are_put_right_together():
                                 + list(LABELS[25:])))
     layout, data = replace(LAYOUT, labels=names), sequence(displaced()).positions
     markers = MarkerSequence(data[:, [*range(20, 25), *range(5, 20), *range(5), 25]], names, 60.0)
-    found = find_worn(MODEL, [markers], layout, find_person(MODEL, markers, layout, USUAL), USUAL)
+    found = find_misplaced_markers(MODEL, [markers], layout, find_person(MODEL, markers, layout, USUAL), USUAL)
     assert found.exchanged == tuple(sides) and not found.moved and not found.unplaced
     np.testing.assert_array_equal(found.restore_names(markers, layout).positions, data)
 
@@ -324,14 +330,14 @@ def test_left_and_right_exchanged_on_many_markers_are_put_right_together():
 def test_where_the_body_is_at_fault_no_marker_is_moved():
     order = np.random.default_rng(0).permutation(26)
     markers = MarkerSequence(sequence(displaced()).positions[:, order], LABELS, 60.0)
-    found = find_worn(MODEL, [markers], LAYOUT, find_person(MODEL, markers, LAYOUT, USUAL), USUAL)
+    found = find_misplaced_markers(MODEL, [markers], LAYOUT, find_person(MODEL, markers, LAYOUT, USUAL), USUAL)
     assert not found.changes and len(found.too_many) > 7 and "the wrong layout" in found.judgement(LABELS).doubts[0]
 
 
 def test_a_marker_moved_by_more_than_a_hand_is_to_be_looked_at():
     moved = [MovedMarker(label, np.arange(3), np.eye(3)[0], 0.01, before, 0.01) for label, before in
              (("M1", 0.07), ("M2", 0.31))]
-    (told,) = Worn(moved=tuple(moved)).judgement(LABELS).doubts
+    (told,) = MisplacedMarkers(moved=tuple(moved)).judgement(LABELS).doubts
     assert told == "moved by more than a hand's width: M2 by 31 cm"
 
 
@@ -351,7 +357,7 @@ def test_a_quarter_of_the_markers_moved_by_more_than_a_hand_means_nothing():
 
 
 def test_markers_in_their_places_are_let_be():
-    found = find_worn(MODEL, [sequence(displaced())], LAYOUT, beside(), USUAL)
+    found = find_misplaced_markers(MODEL, [sequence(displaced())], LAYOUT, beside(), USUAL)
     assert not found.changes and not found.too_many
 
 

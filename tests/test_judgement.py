@@ -22,8 +22,8 @@ from completion.measuring import bodies
 from completion.mocap.animate.work import AnimateTask as Follow
 from completion.mocap.pose.judgement import hardly_seen, judge_motions, motion_doubts, motion_problem
 from completion.mocap.pose.marked_body import AnimateConfig
+from completion.mocap.subject.misplaced_markers import MisplacedMarkers
 from completion.mocap.subject.person import PersonConfig
-from completion.mocap.subject.worn_elsewhere import Worn
 from completion.motion import Motion
 from completion.partial.settings import CompletionConfig
 from completion.partial.work import CompletionInputs, CompletionTask, complete_files
@@ -492,8 +492,8 @@ def test_the_size_of_a_body_far_from_its_markers_is_told_last():
 def test_a_recording_whose_sides_are_all_exchanged_may_be_mirrored():
     labels = ("LSHO", "RSHO", "LELB", "RELB", "LKNE", "RKNE", "C7")
     pairs = tuple(zip(labels[:6:2], labels[1:6:2], strict=True))
-    assert "mirrored recording" in Worn(exchanged=pairs).judgement(labels).doubts[0]
-    assert Worn(exchanged=pairs[:1]).judgement(labels).doubts == ()                  # two labels mixed up are put back
+    assert "mirrored recording" in MisplacedMarkers(exchanged=pairs).judgement(labels).doubts[0]
+    assert MisplacedMarkers(exchanged=pairs[:1]).judgement(labels).doubts == ()      # two labels mixed up are put back
 
 
 def test_what_cannot_be_measured_for_its_size_is_told_so(monkeypatch):

@@ -1,76 +1,84 @@
-"""Every command and snippet of the README runs, on files under the names that it uses; then those of two packages.
+"""Every command and snippet of the documents runs, on files under the names that they use: README and first tasks.
 
-One file, so that one process does it all: these READMEs go on with what the commands of the README wrote. That of
-`model` needs only what the demonstration did: `test_readme_model.py`.
+The other documents are shared out over `test_readme_scans.py`, `test_readme_model.py` and `test_readme_completion.py`,
+so that processes share the work; `readme_folder.PARTS` says who runs which.
 """
 import re
 
 import pytest
-from readme_folder import ROOT, SET_UP, blocks, commands, run_commands, user_folder, with_demo_model
+from readme_folder import (
+    PARTS,
+    README,
+    REST,
+    ROOT,
+    SET_UP,
+    commands,
+    commands_of_part,
+    documents,
+    run_command,
+    run_snippet,
+    snippets_of_part,
+    user_folder,
+)
 from readme_user import of_a_user
 
-README = (ROOT / "README.md").read_text(encoding="utf-8")
-PACKAGES = [f"{package}/README.md" for package in ("scanprep", "completion")]
 pytestmark = pytest.mark.timeout(1800)
 
 
 @pytest.fixture(scope="module")
 def place(demo_folder, tmp_path_factory):
-    """The folder of a user in which the commands of the README were run."""
+    """The folder of a user in which the commands of the README and of its first pages were run."""
     folder = user_folder(demo_folder, tmp_path_factory.mktemp("readme"))
     with of_a_user(folder):
-        run_commands("README.md")
+        for line in commands_of_part("start"):
+            run_command(line)
     return folder
 
 
-@pytest.fixture(scope="module")
-def results(place):
-    """The same folder for the READMEs of the packages."""
-    return with_demo_model(place)
-
-
-@pytest.fixture(autouse=True)
-def there(request):
+@pytest.fixture
+def there(place):
     """Work in that folder."""
-    if "place" not in request.fixturenames:
-        yield
-        return
-    with of_a_user(request.getfixturevalue("place")):
+    with of_a_user(place):
         yield
 
 
 def test_set_up_is_what_ci_does():
-    assert SET_UP <= set(commands("README.md"))
+    assert SET_UP <= set(commands(README))
     ci = (ROOT / ".ci" / "run").read_text()
     assert 'pip install --quiet ".[test]"' in ci and "\npytest\n" in ci
 
 
 def test_commands(place):
-    for written in ("out/report.html", "completed/report.html", "walk/animation.glb", "person/report.html", "walk.glb",
-                    "measures.csv", "smpl.npz", "brought/motion.npz", "walk_of_two/motion.npz", "tracked/motion.npz"):
+    for written in ("out/report.html", "completed/report.html", "walk/animation.glb", "walk.glb", "measures.csv",
+                    "heavier.ply", "set/report.html", "evaluation/report.html", "he.ply"):
         assert (place / written).exists(), written
 
 
-@pytest.mark.parametrize("code", blocks("README.md", "python"))
-def test_snippets(place, code):
-    exec(compile(code, "README.md", "exec"), {})
-    assert (place / "whole.ply").stat().st_size > 10_000
+@pytest.mark.parametrize("document, code", snippets_of_part("start"))
+def test_snippets(there, place, document, code):
+    run_snippet(document, code)
+    if document == README:
+        assert (place / "whole.ply").stat().st_size > 10_000
 
 
-@pytest.mark.parametrize("readme", PACKAGES)
-def test_commands_of_packages(results, readme):
-    run_commands(readme)
-
-
-@pytest.mark.parametrize("readme, code", [(readme, code) for readme in PACKAGES for code in blocks(readme, "python")])
-def test_snippets_of_packages(results, readme, code):
-    exec(compile(code, readme, "exec"), {})
+def test_every_document_is_run_by_one_file():
+    found = [document for part in (*PARTS, REST) for document in documents(part)]
+    assert len(found) == len(set(found))
+    written = {README, *(f"{package}/README.md" for package in ("scanprep", "model", "completion")),
+               *(path.relative_to(ROOT).as_posix() for path in (ROOT / ".docs" / "pages").rglob("*.md"))}
+    assert set(found) == written
 
 
 def test_first_screen_and_limits():
-    head = README[:1500]
+    text = (ROOT / README).read_text(encoding="utf-8")
+    head = text[:1500]
     assert "![" in head and "scape demo" in head
     picture = re.search(r"!\[[^\]]*\]\(([^)]+)\)", head).group(1)
     assert (ROOT / picture).stat().st_size > 20_000
-    assert "## What it does not do" in README
-    assert len(README.splitlines()) <= 200
+    assert "## What it does not do" in text
+
+
+@pytest.mark.parametrize("document, lines", [(README, 150), *((f"{package}/README.md", 120) for package in
+                                                             ("scanprep", "model", "completion"))])
+def test_readmes_are_short(document, lines):
+    assert len((ROOT / document).read_text(encoding="utf-8").splitlines()) <= lines

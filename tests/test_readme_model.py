@@ -1,11 +1,17 @@
-"""Every command and snippet of the README of `model` runs, on what the demonstration made."""
-import shutil
-
+"""Every command and snippet of the documents about models runs; see `test_readme.py`."""
 import pytest
-from readme_folder import blocks, run_commands, user_folder, with_demo_model
+from readme_folder import (
+    commands_of_part,
+    keep_scans,
+    run_command,
+    run_snippet,
+    snippets_of_part,
+    user_folder,
+    with_demo_model,
+)
 from readme_user import of_a_user
 
-README = "model/README.md"
+SCANS = ["subject_00_rest", "subject_01_kick_left", "person_00_female"]              # of one folder: two people
 pytestmark = pytest.mark.timeout(1800)
 
 
@@ -13,7 +19,7 @@ pytestmark = pytest.mark.timeout(1800)
 def place(demo_folder, tmp_path_factory):
     """The folder of a user who has a registered set and a model."""
     folder = with_demo_model(user_folder(demo_folder, tmp_path_factory.mktemp("readme")))
-    shutil.copytree(demo_folder / "set", folder / "set", dirs_exist_ok=True)
+    keep_scans(folder, SCANS)
     return folder
 
 
@@ -25,11 +31,12 @@ def there(place):
 
 
 def test_commands():
-    run_commands(README)
+    lines = commands_of_part("model")
+    assert lines
+    for line in lines:
+        run_command(line)
 
 
-@pytest.mark.parametrize("code", blocks(README, "python"))
-def test_snippets(code):
-    if "import torch" in code:
-        pytest.importorskip("torch")
-    exec(compile(code, README, "exec"), {})
+@pytest.mark.parametrize("document, code", snippets_of_part("model"))
+def test_snippets(document, code):
+    run_snippet(document, code)

@@ -21,7 +21,7 @@ from scanprep import command_line, config_files
 from scanprep.console import Metric, Outcome
 from scanprep.geometry import storage
 from scanprep.judgement import Judgement
-from scanprep.ranges import LARGE, OutOfRange, Range, Settings, ranges
+from scanprep.ranges import LARGE, OutOfRangeError, Range, Settings, ranges
 
 
 def commands(listed=COMMANDS, prog="scape"):
@@ -173,9 +173,9 @@ def test_no_number_of_settings_may_be_nan_or_infinite(cls):
         for kind in kinds(hints[field.name]):
             assert ranges(cls)[field.name].high <= LARGE * 10
             for value in (np.nan, np.inf, -np.inf, 1e300) if kind is float else (-10**12, 10**12):
-                with pytest.raises(OutOfRange, match=rf"^{field.name}: expected"):
+                with pytest.raises(OutOfRangeError, match=rf"^{field.name}: expected"):
                     dataclasses.replace(good, **{field.name: value})
-                with pytest.raises(OutOfRange, match=rf"^{field.name}: expected"):
+                with pytest.raises(OutOfRangeError, match=rf"^{field.name}: expected"):
                     dataclasses.replace(good, **{field.name: (value,)})
 
 
@@ -190,9 +190,9 @@ def test_all_settings_are_checked():
 def test_ranges_in_words():
     assert [str(r) for r in (Range(), Range(1e-12), Range(1e-12, 1), Range(-20, 20), Range(1))] == [
         "at least 0", "above 0", "above 0, at most 1", "-20 to 20", "at least 1"]
-    with pytest.raises(OutOfRange, match=r"^annealing: expected above 0, got 0\.0$"):
+    with pytest.raises(OutOfRangeError, match=r"^annealing: expected above 0, got 0\.0$"):
         PersonConfig(annealing=(1.0, 0.0))
-    with pytest.raises(OutOfRange, match="outlier"):
+    with pytest.raises(OutOfRangeError, match="outlier"):
         dataclasses.replace(MoshConfig().person, outlier=float("nan"))
 
 

@@ -1,4 +1,4 @@
-"""The stages of the demonstration; each is done when something that it depends on has changed since it was done.
+"""The stages of the demonstration; each runs again only when something that it depends on has changed.
 
     scans -> template -> registered set with skeleton -> model -> held-out poses, completion, animation
 """
@@ -49,7 +49,7 @@ from ..motion import Motion
 from ..partial.completion import Completion, complete, load_completion, save_completion
 from .truth import TruthMap, distance, surface_error
 
-MARKER_NOISE = 0.001                     # metres
+MARKER_NOISE = 0.001                     # metres: standard deviation per axis, as optical motion capture has
 
 
 @dataclass(frozen=True)
@@ -85,24 +85,25 @@ class DemoConfig(Settings):
     learn: LearnConfig = field(default_factory=LearnConfig)
 
 
+# --full and --quick: more and finer scans for better figures, or fewer for a first look
 FULL = DemoConfig(poses=20, subjects=12, faces=14000, resolution=0.0068, template_resolution=0.004, held_out=5,
                   frames=132)
 QUICK = DemoConfig(poses=8, subjects=3, faces=7000, resolution=0.011, template_resolution=0.006, held_out=2, rate=30.0)
 
-
+# files of the stages inside the folder
 MODEL, HALF, MOTION = Path("model.npz"), Path("half_view/half_view.ply"), Path("animation/motion.npz")
 
 
 @dataclass(frozen=True)
 class ScanPerson:
-    """The work on each scan: a person made and scanned."""
+    """The work on each scan: make a person and scan it."""
 
     seed: int
     scanner: ScannerConfig
 
-    def __call__(self, which: tuple[int, bool], room: TaskContext) -> SyntheticScan:
-        found = synthetic_scan(room.folder / "scans", self.seed, *which, self.scanner)
-        return replace(found, folder=Path("scans"))
+    def __call__(self, which: tuple[int, bool], context: TaskContext) -> SyntheticScan:
+        entry = synthetic_scan(context.folder / "scans", self.seed, *which, self.scanner)
+        return replace(entry, folder=Path("scans"))
 
 
 @dataclass(frozen=True)
@@ -111,12 +112,12 @@ class Demo:
 
     space: Workspace
     config: DemoConfig
-    # `bar(title)` is a context manager that yields a progress callback
+    # bar(title) is a context manager that yields a progress callback
     bar: Callable[[str], AbstractContextManager[Callable[[int, int], None]]]
 
     @property
     def folder(self) -> Path:
-        """Where all is."""
+        """The output folder."""
         return self.space.folder
 
     @property
@@ -126,20 +127,20 @@ class Demo:
 
     @cached_property
     def scans(self) -> list[SyntheticScan]:
-        """Scans of one subject in many poses and of many subjects."""
+        """Scans of one subject in many poses, and of many subjects."""
         tasks = [Task(f"{SCANS}{'pose' if which[1] else 'person'} {which[0]}", which)
                  for which in scan_plan(self.config.poses, self.config.subjects)]
         with self.bar("scanning people") as progress, one_thread():
             done = self.space.run(ScanPerson(self.config.seed, self.scanner), tasks, progress=progress)
         if done.failures:
             raise ValueError("; ".join(done.failures.values()))
-        for name in set(self.space.list_results(SCANS)) - set(done.values):         # of a run with more scans
+        for name in set(self.space.list_results(SCANS)) - set(done.values):         # left by a run with more scans
             self.space.drop(name)
         scans = [replace(done.values[task.name], folder=self.folder / "scans") for task in tasks]
         rows = [(s.name, s.subject, s.pose, s.sex) for s in scans]
 
         def write(folder: Path) -> None:
-            """What the folder holds, and who is in the scans."""
+            """Write the settings, and the table of who is in the scans."""
             storage.write_json(folder / "demo.json", storage.as_json(self.config))
             (folder / "scans").mkdir()
             tables.write_table(folder / "scans" / TABLE, ("name", "subject", "pose", "sex"), rows)
@@ -149,13 +150,14 @@ class Demo:
 
     @cached_property
     def template(self) -> Mesh:
-        """A careful scan of the subject at rest from more sides, merged, its holes filled, decimated."""
-        # from above and below too, and into places that a fixed scanner does not reach: hands have fingers
+        """The template: a careful scan of the subject at rest from many sides, merged, holes filled, decimated."""
+        # twelve views also from above and below, and deep into narrow places, so that hands get fingers
         scanner = ScannerConfig(views=12, resolution=self.config.template_resolution, height=1.2, blind_reach=0.01)
         settings = TemplateConfig()
         settings = replace(settings, merge=replace(settings.merge, voxel=self.config.template_resolution))
 
         def make(folder: Path) -> None:
+            """Scan the subject, merge the views and write the template."""
             rng = np.random.default_rng([self.config.seed, 6])
             with self.bar("making the template") as progress:
                 careful = scan(self.rest.mesh, scanner, rng)
@@ -163,7 +165,7 @@ class Demo:
                 place = folder / "template_scan"
                 write_scan(place, "rest", careful, self.rest, marks)
                 views = read_views(place / "views" / "rest.npz")
-                # as `scape prep template` reads them: a mesh each, and where the cameras stood
+                # in the form that `scape prep template` reads: a mesh per view, and the positions of the cameras
                 named = {f"view_{k:02d}": view for k, view in enumerate(views)}
                 for name, view in named.items():
                     write_mesh(place / "range_views" / f"{name}.ply", view.mesh)
@@ -179,12 +181,12 @@ class Demo:
 
     @cached_property
     def rest(self) -> GroundTruth:
-        """The true subject at rest, of whom the template is made."""
+        """The true subject at rest, whose scan becomes the template."""
         return stand(self.person, np.zeros((len(self.person.parents), 3)))
 
     @cached_property
     def template_landmarks(self) -> dict[str, int]:
-        """Name -> vertex of the template."""
+        """Landmark name -> vertex of the template."""
         return read_landmark_vertices(self.folder / "template.landmarks.json", self.template)
 
     @cached_property
@@ -194,7 +196,7 @@ class Demo:
         tasks = find_scans(self.folder / "scans")
         with workspace(self.folder / "set", self.space.force) as space:
             stale = set(space.list_results(SCANS)) - {SCANS + task.name for task in tasks}
-            if stale:                                           # first what tells of them
+            if stale:                                           # tables first, as they refer to the scans
                 space.drop("tables")
             for name in stale:
                 space.drop(name)
@@ -206,7 +208,7 @@ class Demo:
 
     @cached_property
     def model(self) -> BodyModel:
-        """The body model."""
+        """The body model, learned from the registered set."""
         registered: RegisteredSet = self.prepared.registered
         assert registered.skeleton is not None, "the subject has enough poses for a skeleton"
         bodies = registered.template, registered.poses("subject"), registered.shapes(), registered.skeleton
@@ -222,12 +224,12 @@ class Demo:
 
     @cached_property
     def subject(self) -> Subject:
-        """The subject's body, of the model."""
+        """The model's body of the subject."""
         return self.model.subject(None)
 
     @cached_property
     def off(self) -> dict[str, tuple[np.ndarray, np.ndarray]]:
-        """Distances (N,), metres, of every registered vertex to the true surface and to its true place, by the scan."""
+        """By scan: distances (N,), metres, of every registered vertex to the true surface, and to its true place."""
         registered, truths = self.prepared.registered, {s.name: GroundTruth.load(s.truth) for s in self.scans}
         return {name: (surface_error(self.template.with_vertices(vertices), truths[name]),
                        distance(vertices, self.truth_map.vertices(truths[name])))
@@ -245,7 +247,7 @@ class Demo:
         return [stand(self.person, random_pose(rng)) for _ in range(self.config.held_out)]
 
     def fit_pose(self, wanted: np.ndarray) -> np.ndarray:
-        """The model's vertices (N, 3) in the pose that comes closest to `wanted` (N, 3)."""
+        """Compute the model's vertices (N, 3) in the pose that comes closest to `wanted` (N, 3)."""
         return fit_pose(self.subject, wanted).vertices
 
     @cached_property
@@ -253,14 +255,14 @@ class Demo:
         """What one camera sees of the first held-out pose, a few landmarks on it, and the truth."""
         truth, scanner = self.held_out[0], replace(self.scanner, views=1, azimuth=-30.0)
 
-        landmarks = 7  # that are marked on the half view
+        landmarks = 7  # number that somebody clicks on the half view
         def make(folder: Path) -> None:
             rng = np.random.default_rng([self.config.seed, 8])
             seen = scan(truth.mesh, scanner, rng)
             marks = click_landmarks(truth, rng, seen=seen.merged.vertices)
-            few = spread_indices(len(marks), landmarks)
+            chosen = spread_indices(len(marks), landmarks)
             write_scan(folder / HALF.parent, HALF.stem, seen, truth,
-                       {name: marks[name] for name in np.array(list(marks))[few]}, views=False)
+                       {name: marks[name] for name in np.array(list(marks))[chosen]}, views=False)
 
         self.space.step("half view", (self.config.seed, scanner, landmarks), make)
         half = self.folder / HALF
@@ -282,7 +284,7 @@ class Demo:
 
     @cached_property
     def walk(self) -> tuple[MarkerSequence, MarkerLayout, np.ndarray]:
-        """Markers of a walking subject, where they sit on the template, and the true vertices (T, N, 3)."""
+        """Markers of the walking subject, their places on the template, and the true vertices (T, N, 3)."""
         poses, trans = synthesise_walk(self.config.frames, self.config.rate)
         bodies = np.stack([self.person.in_pose(pose, place) for pose, place in zip(poses, trans, strict=True)])
         template, config = self.template, self.config
@@ -297,7 +299,7 @@ class Demo:
 
     @cached_property
     def motion(self) -> Motion:
-        """The walk followed by the model."""
+        """The model's motion that follows the markers of the walk."""
         (sequence, layout, _), subject = self.walk, self.subject
 
         def make(folder: Path) -> None:
@@ -314,17 +316,18 @@ class Demo:
 
 
 def record_walk(folder: Path, bodies: np.ndarray, rest: GroundTruth, template: Mesh, config: DemoConfig,
-                tell: Callable[[int, int], None]) -> None:
-    """Write the markers of a walking person (T, N, 3), and where they sit on the template."""
+                report_progress: Callable[[int, int], None]) -> None:
+    """Write the markers of a walking person (T, N, 3), and their places on the template."""
     rng = np.random.default_rng([config.seed, 9])
     labels, places = tuple(MARKERS), np.array(list(MARKERS.values()))
-    out = []
+    exact_markers = []
     for i, body in enumerate(bodies):
-        out.append(body[places] + DISTANCE * Mesh(body, rest.faces).vertex_normals[places])
-        tell(i + 1, len(bodies))
-    positions = np.stack(out) + rng.normal(0, MARKER_NOISE, (len(bodies), len(labels), 3))
+        exact_markers.append(body[places] + DISTANCE * Mesh(body, rest.faces).vertex_normals[places])
+        report_progress(i + 1, len(bodies))
+    positions = np.stack(exact_markers) + rng.normal(0, MARKER_NOISE, (len(bodies), len(labels), 3))
+    # 3% of the markers are missing at any time, as behind an arm
     positions[rng.random(positions.shape[:2]) < 0.03] = np.nan
-    # as on a real subject: the layout is read off the scan at rest, on which the markers can be seen
+    # as with a real subject, the layout is read from the scan at rest, on which the markers are visible
     _, vertices = cKDTree(template.vertices).query(rest.vertices[places])
     MarkerLayout(labels, vertices, DISTANCE).save(folder / "layout.json")
     sequence = MarkerSequence(positions, labels, config.rate)

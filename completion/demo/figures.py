@@ -1,4 +1,4 @@
-"""The figures of the demonstration against the ground truth."""
+"""Figures of the demonstration against the ground truth."""
 from __future__ import annotations
 
 from collections.abc import Sequence
@@ -17,17 +17,17 @@ from ..mocap.pose.judgement import motion_doubts
 from .chain import Demo
 from .truth import distance, joint_errors, mean_over_area, rand_index, surface_error
 
-NAMED = ("head", "hand_left", "hand_right", "foot_left", "foot_right")     # without which motions cannot be exported
+NAMED = ("head", "hand_left", "hand_right", "foot_left", "foot_right")     # parts that exports of motions need
 
 
 def measure_demo(demo: Demo) -> list[Metric]:
-    """Run what has not been run, and measure it against the ground truth: errors on what was not learned come first."""
+    """Run the stages that have not been run, and measure them; errors on unseen data come first."""
     template, at = demo.template, demo.truth_map
-    # poses that the model never saw
+    # held-out poses, which the model never saw
     wanted = [at.vertices(truth) for truth in demo.held_out]
     error = [mean_over_area(distance(demo.fit_pose(w), w), template) for w in wanted]
     rows = [Metric(f"model: {len(wanted)} poses it never saw, mean error", MM * float(np.mean(error)), "mm")]
-    # the half view
+    # the completed half view, separately for surface that was seen and that was hidden
     done, (half, _, truth) = demo.completion, demo.half_scan
     surface, true = surface_error(done.completed, truth), at.vertices(truth)
     apart = distance(done.completed.vertices, true)
@@ -36,14 +36,14 @@ def measure_demo(demo: Demo) -> list[Metric]:
              Metric("completion, seen: mean distance to the true surface",
                     MM * mean_over_area(surface, template, seen), "mm"),
              Metric("completion: share of the body that was seen", 100 * float(seen.mean()), "%", detail=True)]
-    # the walk
+    # the walk, followed by its markers
     motion, (_, _, bodies), faces = demo.motion, demo.walk, demo.person.mesh.faces
     walked = [distance(body, at.places.transfer(true_body, faces))
               for body, true_body in zip(motion.vertices(demo.subject), bodies, strict=True)]
     rows += [Metric("animation: mean error", MM * mean_over_area(np.mean(walked, axis=0), template), "mm"),
              Metric("animation: markers to their place on the body, mean", MM * float(np.nanmean(motion.residuals)),
                     "mm")]
-    # scans, and the skeleton found from them
+    # registered scans, and the skeleton found from them
     means = {name: mean_over_area(off, template) for name, (off, _) in demo.off.items()}
     slid = [mean_over_area(off, template) for _, off in demo.off.values()]
     worst = max(means, key=means.__getitem__)
@@ -60,7 +60,7 @@ def measure_demo(demo: Demo) -> list[Metric]:
 
 
 def judge_demo(demo: Demo, metrics: Sequence[Metric]) -> Judgement:
-    """What each result says of itself, whether it came near the truth, and whether parts have the names of exports."""
+    """Judge the demonstration: each result's own judgement, its distance from the truth, and names of parts."""
     folder = demo.folder / "set"
     set_of_scans = judge_whole(judge_set(folder), RegisteredSet.load(folder).skeleton)
     motion = Judgement.of(check=motion_doubts([demo.motion], [demo.walk[0]], demo.template))
@@ -68,7 +68,7 @@ def judge_demo(demo: Demo, metrics: Sequence[Metric]) -> Judgement:
                              "completion": demo.completion.judgement, "animation": motion})
     lacking = [name for name in NAMED if name not in demo.model.skeleton.names]
     values = {metric.name: float(metric.value) for metric in metrics if not isinstance(metric.value, str)}
-    # Half as much again as seed 0 gives: mean errors of a vertex, millimetres
+    # mean errors of a vertex, millimetres: 1.5 times those of seed 0, so that a broken stage shows
     limits = {"model": 12.0, "completion, hidden": 25.0, "completion, seen": 3.0, "animation": 15.0,
               "registration": 1.5}
     doubts = [f"{name}: {value:.1f} mm" for name, value in values.items() for stage, limit in limits.items()

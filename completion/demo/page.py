@@ -1,4 +1,4 @@
-"""The page of the demonstration: a picture of every stage."""
+"""The page of the demonstration, with a picture of every stage."""
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
@@ -26,11 +26,11 @@ from ..partial.report import COMPLETED, HEIGHT, MEASURED, completion_panes, pict
 from .chain import Demo
 from .truth import distance, mean_over_area, surface_error
 
-FAR = 0.01                 # metres at the end of the heat maps
+FAR = 0.01                 # metres at the dark end of the heat maps
 
 
-def write_page(demo: Demo, metrics: list[Metric], judgement: Judgement, tell: Callable[[int, int], None],
-               to: Path) -> None:
+def write_page(demo: Demo, metrics: list[Metric], judgement: Judgement,
+               report_progress: Callable[[int, int], None], to: Path) -> None:
     """Write `report.html`, the animated GLB and pictures into a folder."""
     page = Page("From raw scans to a moving person",
                 "Every stage of the chain on the built-in people, whose true shape, pose and correspondence are known.")
@@ -41,41 +41,43 @@ def write_page(demo: Demo, metrics: list[Metric], judgement: Judgement, tell: Ca
         partial(_animation, to=to))
     for i, stage in enumerate(stages):
         stage(demo, page)
-        tell(i + 1, len(stages))
-    # the chain: scan, registration, parts, body shapes, completion, animation
-    template, model, done = demo.template, demo.model, demo.completion
+        report_progress(i + 1, len(stages))
+    # one picture of the whole chain: scan, registration, parts, body shapes, completion, animation
+    template, model, completion = demo.template, demo.model, demo.completion
     name = demo.scans[1].name                       # the first pose after rest
     registered = template.with_vertices(demo.prepared.registered.vertices([name])[0])
     rest = np.zeros((len(model.skeleton.parents), 3))
     people = [template.with_vertices(model.vertices(rest, betas)) for betas in (np.array([-1.8]), np.array([1.8]))]
     walking = demo.motion.vertices(demo.subject, np.array([0, len(demo.motion.poses) // 4]))
-    colors = np.where(done.seen[:, None], MEASURED, COMPLETED)
+    colors = np.where(completion.seen[:, None], MEASURED, COMPLETED)
     shown: list[tuple[Mesh | Solid, np.ndarray, float, str]] = [
         (read_mesh(demo.folder / "scans" / f"{name}.ply"), registered.vertices, 25, "scan"),
         (registered, registered.vertices, 25, "registered"),
         (Solid(template, part_colors(model.skeleton.part_of_face)), template.vertices, 0, "parts found"),
         *((person, np.concatenate([p.vertices for p in people]), 15.0, "body shape") for person in people),
-        (Solid(demo.half_scan[0], MEASURED), done.completed.vertices, -30, "half a view"),
-        (Solid(done.completed, colors), done.completed.vertices, 30, "completed"),
+        (Solid(demo.half_scan[0], MEASURED), completion.completed.vertices, -30, "half a view"),
+        (Solid(completion.completed, colors), completion.completed.vertices, 30, "completed"),
         *((template.with_vertices(v), v, 40.0, "animated") for v in walking)]
     save_png(to / "overview.png", picture_panes(
-        [_pane(demo, shape, fits, label, turn) for shape, fits, turn, label in shown], 400))
+        [_pane(demo, shape, framed, label, turn) for shape, framed, turn, label in shown], 400))
     page.write(to / "report.html")
 
 
 def _pane(demo: Demo, shape: Mesh | Solid, fits: np.ndarray, label: str, turn: float = 25.0) -> Pane:
+    """Make a pane of a shape, framed like the vertices `fits`, seen from `turn` degrees beside the front."""
     solid = shape if isinstance(shape, Solid) else Solid(shape)
-    # triangles of one of many bodies
+    # 15,000 triangles are enough for one of many bodies on the page
     return Pane([thin_solid(solid, 15_000)], look_around(demo.template, fits, (turn,))[0], label)
 
 
 def _in_rows(page: Page, panes: Sequence[Pane], caption: str) -> None:
-    """Figures of two pairs each."""
+    """Add panes in figures of two pairs each."""
     for i in range(0, len(panes), 4):
         page.bodies(panes[i:i + 4], caption, 340)
 
 
 def _scans(demo: Demo, page: Page) -> None:
+    """Add six scans."""
     page.section("Scans", "Four range views of each person, as a scanner sees them: 2 mm noise, holes under the arms, "
                  "between the legs and wherever nothing was in sight. Seen from behind, a surface is dark.")
     chosen = demo.scans[:3] + [s for s in demo.scans if s.subject != "subject"][:3]
@@ -85,6 +87,7 @@ def _scans(demo: Demo, page: Page) -> None:
 
 
 def _template(demo: Demo, page: Page) -> None:
+    """Add the template and its error."""
     page.section("Template", "A careful scan of the subject at rest: its views merged in a volume, its holes filled, "
                  "decimated to well-shaped triangles. All other scans are described by bending it.")
     mesh = demo.template
@@ -94,6 +97,7 @@ def _template(demo: Demo, page: Page) -> None:
 
 
 def _registration(demo: Demo, page: Page) -> None:
+    """Add the worst registrations, and a table of them."""
     page.section("Registration", "The template on the scans: first bent by the landmarks, then drawn to the scan, at "
                  "last following it to its noise.")
     registered = demo.prepared.registered
@@ -117,6 +121,7 @@ def _registration(demo: Demo, page: Page) -> None:
 
 
 def _skeleton(demo: Demo, page: Page) -> None:
+    """Add parts and joints."""
     page.section("Skeleton", "The parts that move rigidly, found from the registered poses of the subject without "
                  "being told how many, and the joints between them.")
     skeleton = demo.model.skeleton
@@ -124,27 +129,30 @@ def _skeleton(demo: Demo, page: Page) -> None:
 
 
 def _shapes(demo: Demo, page: Page) -> None:
+    """Add the mean body and the first shape components."""
     page.section("Body shape", "The mean person and the first principal components of the shape deformations, each at "
                  "two standard deviations to either side.")
     page.bodies(component_panes(demo.model), "mean and components", 300)
 
 
 def _poses(demo: Demo, page: Page) -> None:
+    """Add the held-out poses, each beside the truth."""
     page.section("Poses that were never scanned", "The model in held-out poses, coloured by the distance of "
                  "corresponding points to the truth.")
     panes = []
     for truth in demo.held_out:
         wanted = demo.truth_map.vertices(truth)
-        found = demo.fit_pose(wanted)
-        error = distance(found, wanted)
-        off = Heat(error, 0, 3 * FAR, "distance of corresponding points")
-        panes += [_pane(demo, truth.mesh, found, "truth"),
-                  _pane(demo, Solid(demo.template.with_vertices(found), off), found,
+        fitted = demo.fit_pose(wanted)
+        error = distance(fitted, wanted)
+        error_shade = Heat(error, 0, 3 * FAR, "distance of corresponding points")
+        panes += [_pane(demo, truth.mesh, fitted, "truth"),
+                  _pane(demo, Solid(demo.template.with_vertices(fitted), error_shade), fitted,
                         f"model, {1000 * mean_over_area(error, demo.template):.1f} mm")]
     _in_rows(page, panes, "the truth, and the model beside it")
 
 
 def _completion(demo: Demo, page: Page, to: Path) -> None:
+    """Add the half view, the completed body, and its error."""
     page.section("Completion", "One camera saw the person from one side, in a pose that is in no training scan. Blue "
                  "was measured, yellow was filled in by the model.")
     half, marks, truth = demo.half_scan
@@ -161,6 +169,7 @@ def _completion(demo: Demo, page: Page, to: Path) -> None:
 
 
 def _animation(demo: Demo, page: Page, to: Path) -> None:
+    """Add the walk with its markers, and a chart of their distances."""
     sequence, _, _ = demo.walk
     motion, subject = demo.motion, demo.subject
     page.section("Animation", f"{len(sequence.labels)} markers of a walk, 3% of them missing at any time, and the body "

@@ -1,4 +1,4 @@
-"""How far the results of the chain are from the ground truth of the built-in people."""
+"""Errors of the results of the chain against the ground truth of the built-in people."""
 from __future__ import annotations
 
 from dataclasses import dataclass
@@ -13,7 +13,7 @@ from scanprep.synthetic.data_set import GroundTruth
 
 @dataclass(frozen=True, eq=False)
 class TruthMap:
-    """Where each vertex of the template truly lies on any of them: all of them share one triangulation."""
+    """Where each vertex of the template truly lies on any person: all people share one triangulation."""
 
     template: Mesh
     places: SurfacePoints  # the true surface points nearest to the template's vertices
@@ -21,42 +21,43 @@ class TruthMap:
 
     @staticmethod
     def of(template: Mesh, rest: GroundTruth) -> TruthMap:
-        """From the truth of the scan that the template was made of."""
+        """Build the map from the truth of the scan that the template was made of."""
         surface = Surface(rest.mesh)
         middle = surface.closest(template.corners.mean(axis=1))
         return TruthMap(template, surface.closest(template.vertices), rest.part_of_face[middle.faces])
 
     def vertices(self, truth: GroundTruth) -> np.ndarray:
-        """True places (N, 3) of the template's vertices, metres."""
+        """Compute the true places (N, 3) of the template's vertices, metres."""
         return self.places.transfer(truth.vertices, truth.faces)
 
 
 def distance(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """(N,) distances of corresponding points (N, 3)."""
+    """Compute distances (N,) of corresponding points (N, 3)."""
     return np.linalg.norm(a - b, axis=1)
 
 
 def surface_error(mesh: Mesh, truth: GroundTruth) -> np.ndarray:
-    """Distance (N,) of the vertices of a mesh to the true surface, metres."""
+    """Compute the distance (N,), metres, of the vertices of a mesh to the true surface."""
     return Surface(truth.mesh).closest(mesh.vertices).distances
 
 
 def mean_over_area(values: np.ndarray, mesh: Mesh, where: np.ndarray | None = None) -> float:
-    """The mean of values (N,) over the surface, or over the vertices in `where` (N,) bool."""
+    """Compute the mean of values (N,) over the surface, or over the vertices in `where` (N,) bool."""
     weights = mesh.vertex_areas if where is None else mesh.vertex_areas * where
     return float(values @ weights / weights.sum())
 
 
 def rand_index(one: np.ndarray, other: np.ndarray, weights: np.ndarray) -> float:
-    """Agreement of two labellings (n,) with weights (n,): 1 the same partition, 0 as by chance."""
+    """Compute the adjusted Rand index of two labellings (n,) with weights (n,): 1 the same, 0 as by chance."""
     table = np.zeros((one.max() + 1, other.max() + 1))
     np.add.at(table, (one, other), weights / weights.sum())
+    # pairs of points that share a label in both, in one, and in the other labelling
     together, rows, columns = (float((t**2).sum()) for t in (table, table.sum(axis=1), table.sum(axis=0)))
     chance = rows * columns
     return (together - chance) / (0.5 * (rows + columns) - chance)
 
 
 def joint_errors(skeleton: Skeleton, rest: GroundTruth) -> np.ndarray:
-    """Distance (J - 1,) of every joint found to the nearest true one at rest, metres."""
+    """Compute the distance (J - 1,), metres, of every joint to the nearest true one at rest."""
     apart = np.linalg.norm(skeleton.joints[1:, None] - rest.joints[None, 1:], axis=2)
     return apart.min(axis=1)

@@ -1,1 +1,1 @@
-"""The command `scape measure`: bodies from files, their measurements in a table and on a page."""
+"""The command `scape measure`: measure bodies from files, in a table and on a page."""

@@ -1,4 +1,4 @@
-"""Bodies that files hold: registered, completed, or as betas of a model."""
+"""Read bodies from files: registered, completed, or as betas of a model."""
 from __future__ import annotations
 
 import warnings
@@ -27,15 +27,16 @@ from scanprep.words import number_of
 from ..partial.completion import load_completion
 from ..viewing.kinds import model_of_report
 
-COMPLETED, PERSON, MOTION = "completion.npz", "subject.json", "motion.npz"      # files that tell what a folder is
+# files by which the folders of commands are recognised
+COMPLETED, PERSON, MOTION = "completion.npz", "subject.json", "motion.npz"
 
 
 @dataclass(frozen=True, eq=False)
 class Body:
-    """One body to be measured.
+    """One body to measure.
 
-    `betas`: it is that of a model in the pose of its template. `path` is where it comes from, for landmarks and
-    messages; `expected_error` (N,), metres.
+    `betas`: made from shape coefficients, so it stands as the model's template does. `path`: its origin, for landmarks
+    and messages. `expected_error`: (N,) metres, of a completed body.
     """
 
     name: str
@@ -46,27 +47,27 @@ class Body:
 
 
 def read_bodies(paths: Sequence[Path], model: BodyModel | None, unit: Unit | None) -> list[Body]:
-    """All bodies of files and folders, in the triangles of one template.
+    """Read all bodies of files and folders, in the triangles of one template.
 
     Raises
     ------
     ValueError
-        None, betas without a model, or other triangles.
+        No bodies, betas without a model, or other triangles.
     """
-    found = [body for path in paths for body in _bodies(path, model, unit)]
-    if not found:
+    bodies = [body for path in paths for body in _bodies(path, model, unit)]
+    if not bodies:
         raise ValueError("BODY: expected at least one body, found none")
-    first = found[0].mesh if model is None else model.template
-    whose = found[0].path if model is None else "the model"
-    for body in found:
+    first = bodies[0].mesh if model is None else model.template
+    whose = bodies[0].path if model is None else "the model"
+    for body in bodies:
         if not np.array_equal(body.mesh.faces, first.faces):
             raise ValueError(f"{body.path}: expected the triangles of {whose} ({first}), found {body.mesh}; register "
                              "the template to it first (scape prep register), or measure it in a call of its own")
-    return found
+    return bodies
 
 
 def model_of(paths: Sequence[Path]) -> Path | None:
-    """The model that the reports of folders name; None where none does, or it is gone."""
+    """Return the model that the reports of folders name; None where none does, or it does not exist any more."""
     for path in paths:
         folders = [path, *(p.parent for p in sorted(path.glob("*/report.json")))] if path.is_dir() else [path.parent]
         for folder in folders:
@@ -77,21 +78,21 @@ def model_of(paths: Sequence[Path]) -> Path | None:
 
 
 def _bodies(path: Path, model: BodyModel | None, unit: Unit | None) -> Iterator[Body]:
-    """The bodies of one file or folder."""
+    """Yield the bodies of one file or folder."""
     if not path.exists():
         raise ValueError(f"{path}: there is no such file or folder")
     if not path.is_dir():
         yield _of_file(path, model, unit)
     elif (path / "set.json").exists():
-        whole = RegisteredSet.load(path)
-        for entry in whole.entries:
-            yield Body(entry.name, whole.template.with_vertices(whole.vertices([entry.name])[0]), path)
+        registered = RegisteredSet.load(path)
+        for entry in registered.entries:
+            yield Body(entry.name, registered.template.with_vertices(registered.vertices([entry.name])[0]), path)
     elif (path / COMPLETED).exists():
-        done = load_completion(path)
-        yield Body(path.name, done.completed, path, expected_error=done.expected_error)
+        completion = load_completion(path)
+        yield Body(path.name, completion.completed, path, expected_error=completion.expected_error)
     elif (path / PERSON).exists() or (path / MOTION).exists():
-        known = path / PERSON if (path / PERSON).exists() else path / MOTION
-        yield _of_betas(path.name, known, model)
+        file = path / PERSON if (path / PERSON).exists() else path / MOTION
+        yield _of_betas(path.name, file, model)
     else:
         inner = sorted({p.parent for name in (COMPLETED, PERSON, MOTION) for p in path.glob(f"*/{name}")})
         for folder in inner:
@@ -101,7 +102,7 @@ def _bodies(path: Path, model: BodyModel | None, unit: Unit | None) -> Iterator[
 
 
 def _of_file(path: Path, model: BodyModel | None, unit: Unit | None) -> Body:
-    """A mesh, or betas."""
+    """Read the body of a mesh, or of betas."""
     if path.suffix.lower() in (".json", ".npz"):
         return _of_betas(name_of(path), path, model)
     error = None
@@ -111,34 +112,35 @@ def _of_file(path: Path, model: BodyModel | None, unit: Unit | None) -> Body:
 
 
 def _of_betas(name: str, path: Path, model: BodyModel | None) -> Body:
+    """Compute the body of betas, in the pose of the model's template."""
     if model is None:
         raise ValueError(f"{path}: betas need their model; name it with -m")
     body = read_subject(model, path).vertices(np.zeros((len(model.skeleton.parents), 3)))
     return Body(name, model.template.with_vertices(body), path, betas=True)
 
 
-def landmarks_of(given: Path | None, bodies: Sequence[Body], model: BodyModel | None) -> tuple[Mesh, dict[str, int]]:
-    """The template that tapes are found on, and its landmarks.
+def landmarks_of(file: Path | None, bodies: Sequence[Body], model: BodyModel | None) -> tuple[Mesh, dict[str, int]]:
+    """Return the template that tapes are defined on, and its landmarks.
 
-    The model's, which keeps its own; else that of the set; else the first body. Landmarks are in the file given, or
-    beside, or known by the triangles: those of the built-in people. Where tapes begin at others too, as they do when
-    ten were clicked, the average person finds them.
+    The template is the model's, else that of the set, else the first body. Landmarks are from the given file, the
+    model, a file beside the bodies, or those of the built-in people if the triangles are theirs. Where tapes need more,
+    they are found by registering the average person.
     """
     from scanprep.synthetic.landmarks import landmarks
     from scanprep.synthetic.topology import load_topology
 
-    # the template, and the landmarks that somebody gave it
-    first = bodies[0] if bodies else None
+    # the template, and the landmarks that are known of it
+    body = bodies[0] if bodies else None
     if model is not None:
         template = model.template
     else:
-        assert first is not None
-        template = RegisteredSet.load(first.path).template if (first.path / "set.json").exists() else first.mesh
-    beside = None if first is None else landmarks_beside(first.path) if not first.path.is_dir() else next(
-        (path for path in [first.path / "landmarks.json"] if path.exists()), None)
+        assert body is not None
+        template = RegisteredSet.load(body.path).template if (body.path / "set.json").exists() else body.mesh
+    beside = None if body is None else landmarks_beside(body.path) if not body.path.is_dir() else next(
+        (path for path in [body.path / "landmarks.json"] if path.exists()), None)
     known = dict[str, int]()
-    if given is not None:
-        known = read_landmark_vertices(given, template)
+    if file is not None:
+        known = read_landmark_vertices(file, template)
     elif model is not None and model.info.get("landmarks"):
         known = dict(model.info["landmarks"])
     elif beside is not None:
@@ -146,13 +148,13 @@ def landmarks_of(given: Path | None, bodies: Sequence[Body], model: BodyModel | 
     elif np.array_equal(template.faces, load_topology().mesh.faces):
         known = landmarks()
 
-    # those that tapes begin at besides
-    lacking = [name for name in MEASURED if name not in translate_landmarks(known)]
-    if not lacking:
+    # further landmarks that tapes need
+    missing = [name for name in MEASURED if name not in translate_landmarks(known)]
+    if not missing:
         return template, known
     with bar("looking for the other landmarks") as progress:
-        found = find_landmarks(template, known, progress)
-    more = {name: found[name] for name in lacking if name in found}
+        located = find_landmarks(template, known, progress)
+    more = {name: located[name] for name in missing if name in located}
     if not more and not known:
         size = implausible_body(*stature_and_volume(template)).reasons
         raise ValueError("".join(f"{reason}; " for reason in size[:1]) + "measuring begins at landmarks of the "
@@ -166,11 +168,11 @@ def landmarks_of(given: Path | None, bodies: Sequence[Body], model: BodyModel | 
 
 
 def check_standing(tapes: Tapes, body: Body) -> None:
-    """Refuse a body as the template of others if its legs bend or its arms are not below the shoulders."""
+    """Raise ValueError for a template whose legs are bent, or whose arms are not below the shoulders."""
     for name, (first, second) in tapes.limbs.items():
         way = second.at(tapes.template.vertices) - first.at(tapes.template.vertices)
         angle = float(np.degrees(np.arccos(-way @ tapes.axes[0] / np.linalg.norm(way))))
-        if angle > (25 if name.endswith("shin") else 75):           # degrees from hanging, on somebody who stands
+        if angle > (25 if name.endswith("shin") else 75):           # degrees from vertical of a standing person
             raise ValueError(f"{body.path}: it is the template of all bodies, as no model is named, and does not stand "
                              f"upright: the {name} is {angle:.0f} degrees from it; name one that stands first, or the "
                              "model with -m")

@@ -78,18 +78,18 @@ def measure_bodies(bodies: BodiesArg = (), *, output: Output, model: ModelOrNone
     tapes = find_tapes(*landmarks_of(landmarks, read, loaded))
     if loaded is None:
         check_standing(tapes, read[0])
-    found, stood = _measure(read, loaded, tapes)
+    measured, standing = _measure(read, loaded, tapes)
     names = [body.name for body in read]
-    write_measures(output, names, found, sex)
-    measures_page(names, stood, found, tapes, sex).write(output.with_suffix(".html"))
-    return Outcome(output, _figures(names, found, sex), {"model": None if named is None else str(named)},
-                   judgement=judge_bodies(names, found, [tapes.template.with_vertices(body) for body in stood]))
+    write_measures(output, names, measured, sex)
+    measures_page(names, standing, measured, tapes, sex).write(output.with_suffix(".html"))
+    return Outcome(output, _figures(names, measured, sex), {"model": None if named is None else str(named)},
+                   judgement=judge_bodies(names, measured, [tapes.template.with_vertices(body) for body in standing]))
 
 
 def _measure(bodies: Sequence[Body], model: BodyModel | None, tapes: Tapes
              ) -> tuple[list[Measurements], list[np.ndarray]]:
-    """The measurements of bodies, and their vertices (N, 3) as they were measured."""
-    found, stood = list[Measurements](), list[np.ndarray]()
+    """Measure bodies; return measurements and the vertices (N, 3) as they were measured."""
+    measured, standing = list[Measurements](), list[np.ndarray]()
     with bar("measuring") as progress:
         for number, body in enumerate(bodies):
             vertices, axes = body.mesh.vertices, tapes.axes if body.betas else None
@@ -97,54 +97,59 @@ def _measure(bodies: Sequence[Body], model: BodyModel | None, tapes: Tapes
             if not body.betas and model is not None and not stands(vertices, tapes):
                 rest = np.zeros((len(model.skeleton.parents), 3))
                 vertices, axes = own_body(model, vertices).subject.vertices(rest), tapes.axes
-            stood.append(vertices)
-            found.append(measure(vertices, tapes, axes, body.expected_error))
+            standing.append(vertices)
+            measured.append(measure(vertices, tapes, axes, body.expected_error))
             progress(number + 1, len(bodies))
-    return found, stood
+    return measured, standing
 
 
-def write_measures(path: Path, names: Sequence[str], found: Sequence[Measurements], sex: Sex | None = None) -> None:
-    """One line a body: its name, measurements in metres and kilograms, their expected errors, percentiles among people
-    of a sex where one is given, and why some are missing.
+def write_measures(path: Path, names: Sequence[str], measured: Sequence[Measurements], sex: Sex | None = None) -> None:
+    """Write a table with one line per body.
+
+    Columns are name, measurements in metres and kilograms, expected errors, percentiles among people of a sex if given,
+    and notes on what is missing.
     """
     columns = list(CATALOGUE)
     compared = list(percentiles(dict.fromkeys(columns, 1.0), sex)) if sex else []
 
-    def line(name: str, mine: Measurements) -> list[str]:
-        values, errors = mine.values, mine.errors
+    def line(name: str, measurements: Measurements) -> list[str]:
+        """Return the line of one body."""
+        values, errors = measurements.values, measurements.errors
         shares = percentiles(values, sex) if sex else {}
-        notes = [*mine.turned, *(f"{word}: {why}" for word, why in mine.missing.items())]
+        notes = [*measurements.turned, *(f"{word}: {why}" for word, why in measurements.missing.items())]
         return [name, *(f"{values[c]:.4f}" if c in values else "" for c in columns),
                 *(f"{errors[c]:.4f}" if c in errors else "" for c in columns),
                 *(f"{shares[c]:.1f}" if c in shares else "" for c in compared), "; ".join(notes)]
 
     write_table(path, ["body", *columns, *(f"{c}_error" for c in columns), *(f"{c}_percentile" for c in compared),
-                       "note"], map(line, names, found))
+                       "note"], map(line, names, measured))
 
 
-def judge_bodies(names: Sequence[str], found: Sequence[Measurements], bodies: Sequence[Mesh]) -> Judgement:
-    """Whether bodies were measured as people are: in the standard pose, completely, and in the right unit."""
+def judge_bodies(names: Sequence[str], all_measured: Sequence[Measurements], bodies: Sequence[Mesh]) -> Judgement:
+    """Judge whether bodies were measured properly: in the standard pose, completely, in the right unit."""
     absurd, doubts = list[str](), list[str]()
-    for name, mine, body in zip(names, found, bodies, strict=True):
-        if "stature" in mine.values:
-            known = implausible_body(mine.values["stature"], stature_and_volume(body)[1])
+    for name, one, body in zip(names, all_measured, bodies, strict=True):
+        if "stature" in one.values:
+            known = implausible_body(one.values["stature"], stature_and_volume(body)[1])
             absurd += [f"{name}: {reason}" for reason in known.problems]
             doubts += [f"{name}: {reason}" for reason in known.doubts]
-        out = [word for word, value in mine.values.items() if word != "weight" and      # judged by its volume above
+        # measurements more than 30% beyond the range of people
+        out = [word for word, value in one.values.items() if word != "weight" and      # judged by volume above
                not 0.7 * CATALOGUE[word].low <= value <= 1.3 * CATALOGUE[word].high]
-        if len(out) > len(mine.values) / 2:
-            absurd.append(f"{name}: no person measures so, {out[0]} {mine.values[out[0]]:.3g} m: the wrong unit "
+        if len(out) > len(one.values) / 2:
+            absurd.append(f"{name}: no person measures so, {out[0]} {one.values[out[0]]:.3g} m: the wrong unit "
                           "(--unit), or other landmarks?")
         elif out:
             usual = CATALOGUE[out[0]]
-            doubts.append(f"{name}: {out[0].replace('_', ' ')} is {usual.text(mine.values[out[0]])}, people have "
+            doubts.append(f"{name}: {out[0].replace('_', ' ')} is {usual.text(one.values[out[0]])}, people have "
                           f"{usual.text(usual.low)} to {usual.text(usual.high)}: look at its tape on the page")
-        doubts += [f"{name}: {turned}; name the model with -m" for turned in mine.turned[:1]]
-        # an open surface has no volume to weigh, which is no fault of it
-        missing = [word for word in mine.missing if word in CATALOGUE and word != "weight"]
+        doubts += [f"{name}: {turned}; name the model with -m" for turned in one.turned[:1]]
+        # an open surface has no volume, so no weight: not a fault
+        missing = [word for word in one.missing if word in CATALOGUE and word != "weight"]
         if missing:
-            doubts.append(f"{name}: no {missing[0].replace('_', ' ')}, {mine.missing[missing[0]]}"
+            doubts.append(f"{name}: no {missing[0].replace('_', ' ')}, {one.missing[missing[0]]}"
                           + (f", and {number_of(len(missing) - 1, 'other')}" if len(missing) > 1 else ""))
+    # all bodies impossible: failed; else three reasons to look at them
     if absurd and len({line.partition(": ")[0] for line in absurd}) == len(names):
         return Judgement.of(absurd[:3])
     reasons = [*absurd, *doubts]
@@ -152,25 +157,25 @@ def judge_bodies(names: Sequence[str], found: Sequence[Measurements], bodies: Se
     return Judgement.of(check=[*reasons[:3], *more])
 
 
-def _figures(names: Sequence[str], found: Sequence[Measurements], sex: Sex | None) -> list[Metric]:
-    """All measurements of one body, or how many there are of several."""
-    if len(found) > 1:
+def _figures(names: Sequence[str], measured: Sequence[Measurements], sex: Sex | None) -> list[Metric]:
+    """Return all measurements of one body, or totals for several."""
+    if len(measured) > 1:
         return [Metric("bodies", len(names)),
-                Metric("measurements of all bodies", sum(len(mine.readings) for mine in found)),
-                Metric("left out", sum(len(mine.missing) for mine in found)),
-                Metric("stature, mean", MM * float(np.mean([mine.values["stature"] for mine in found])), "mm")]
-    only = found[0]
-    errors = {name: f" (± {_number(name, error)})" for name, error in only.errors.items()}
-    return [_row(name, value, sex, errors.get(name, "")) for name, value in only.values.items()]
+                Metric("measurements of all bodies", sum(len(each.readings) for each in measured)),
+                Metric("left out", sum(len(each.missing) for each in measured)),
+                Metric("stature, mean", MM * float(np.mean([each.values["stature"] for each in measured])), "mm")]
+    single = measured[0]
+    errors = {name: f" (± {_number(name, error)})" for name, error in single.errors.items()}
+    return [_row(name, value, sex, errors.get(name, "")) for name, value in single.values.items()]
 
 
 def _number(name: str, value: float) -> str:
-    """A value in the unit in which people read it, without that unit."""
+    """Return a value in the unit that people use, without its name."""
     return CATALOGUE[name].text(value).rpartition(" ")[0]
 
 
 def _row(name: str, value: float, sex: Sex | None, more: str = "", detail: bool = False) -> Metric:
-    """A measurement as a row of figures, with its percentile among people of a sex."""
+    """Return a measurement as a row of figures, with its percentile among people of a sex."""
     factor, unit, _ = CATALOGUE[name].shown
     share = percentiles({name: value}, sex).get(name) if sex else None
     compared = f", {ordinal(share)} of {WORDS[sex]}" if sex and share is not None else ""
@@ -179,9 +184,9 @@ def _row(name: str, value: float, sex: Sex | None, more: str = "", detail: bool 
 
 def _make_body(to: Sequence[str], output: Path, model: BodyModel, name: str, landmarks: Path | None, sex: Sex | None
                ) -> Outcome:
-    """The most probable body with some measurements: its mesh, betas and page."""
+    """Make the most probable body with given measurements: its mesh, betas and page."""
     wanted = check_wanted(read_measurements(to))
-    shape_statistics(model, sex)                                       # a sex that it does not know is told at once
+    shape_statistics(model, sex)              # raises at once for a sex that the model does not know
     tapes = find_tapes(*landmarks_of(landmarks, [], model))
     made = body_with_measurements(model, tapes, wanted, sex)
     write_mesh(output, model.template.with_vertices(made.vertices))
@@ -192,7 +197,7 @@ def _make_body(to: Sequence[str], output: Path, model: BodyModel, name: str, lan
     page = measures_page([title], [made.vertices], [measure(made.vertices, tapes, tapes.axes)], tapes, made.sex)
     likely_section(page, made).write(output.with_suffix(".html"))
     say(f"note: the betas are in {betas.name}, for --subject")
-    # what was asked for, how usual that is, and of the rest what people ask for most
+    # the table: what was asked for, how usual that is, and other common measurements
     rows = [_row(word, made.reached[word], made.sex, f", wanted {_number(word, value)}")
             for word, value in made.wanted.items()]
     if made.sex is not None and sex is None:
@@ -201,7 +206,7 @@ def _make_body(to: Sequence[str], output: Path, model: BodyModel, name: str, lan
             "ranges are those of that sex")
     rows += [Metric("from the mean person", made.deviations, "sd"),
              Metric("people as far from the mean in these measurements", 100 * made.rarer, "%")]
-    # of what was not asked for, what stands in the closing table; the page and the report have all
+    # other measurements in the closing table; page and report have all of them
     asked_most = ("stature", "weight", "chest_girth", "waist_girth", "hip_girth", "thigh_girth_left", "crotch_height")
     first = [word for word in asked_most if word in made.likely]
     rows += [_row(word, made.likely[word][1], made.sex, f", likely {_number(word, made.likely[word][0])} to "
@@ -211,14 +216,15 @@ def _make_body(to: Sequence[str], output: Path, model: BodyModel, name: str, lan
 
 
 def judge_wanted(made: WantedBody) -> Judgement:
-    """Whether the body has what was asked for, and whether people have that; what fits least, and what would fit."""
+    """Judge whether the body has what was asked for, and whether people do; name what fits least."""
     def words(name: str) -> str:
+        """Return a name as words."""
         return name.replace("_", " ")
 
     missed = [f"{words(name)} is {CATALOGUE[name].text(made.reached[name])}, not "
               f"{_number(name, made.wanted[name])}: the measurements contradict each other, or nobody whom the model "
               "knows has them" for name, off in made.missed.items()
-              if abs(off) > 10 * CATALOGUE[name].exact]                # 2 mm: two people with tapes differ by more
+              if abs(off) > 10 * CATALOGUE[name].exact]                # 2 mm: two people who measure differ by more
     rare = [f"fewer than one person in {1 / max(made.rarer, 1e-6):,.0f} is so far from the mean, by what the model "
             "knows"] if made.rarer < 1e-3 else []
     if not missed and not rare:
@@ -227,7 +233,7 @@ def judge_wanted(made: WantedBody) -> Judgement:
     low, high = made.usual[name]
     who = f"{WORDS[made.sex]}" if made.sex else "people"
     with_it = " with the other measurements" if len({plain(word) for word in made.wanted}) > 1 else ""
-    # where that is what no person has, the other measurements are to blame as much
+    # if no person can have that, the other measurements are as much the cause
     possible = low < CATALOGUE[name].high and high > CATALOGUE[name].low
     odd = [f"{words(name)} {CATALOGUE[name].text(made.wanted[name])} fits least: most {who}{with_it} have "
            f"{_number(name, low)} to {CATALOGUE[name].text(high)}"] if possible else []
@@ -235,14 +241,14 @@ def judge_wanted(made: WantedBody) -> Judgement:
 
 
 def read_measurements(words: Sequence[str]) -> dict[str, float]:
-    """Metres, or kilograms, by name of `name=value` as they are typed; ValueError for anything else."""
-    given = dict[str, float]()
+    """Read `name=value` words as they are typed: metres or kilograms by name; UsageError for anything else."""
+    measurements = dict[str, float]()
     for word in words:
         name, sign, value = word.partition("=")
         try:
-            given[name] = float(value)
+            measurements[name] = float(value)
         except ValueError:
             sign = ""
-        if not sign or not np.isfinite(given[name]):
+        if not sign or not np.isfinite(measurements[name]):
             raise UsageError(f"--to: expected name=metres, such as waist=0.85, got {word}")
-    return given
+    return measurements

@@ -17,35 +17,35 @@ from scanprep.pictures.page import Page
 from scanprep.pictures.scene import Pane
 from scanprep.pictures.shading import Bones, Dots, Shape, Solid
 
-SHOWN, BESIDE_EACH_OTHER = 6, 3      # bodies that turn on the page, columns of its table; and in one figure
-HEIGHT = (0.25, 0.30, 0.38)          # colour of the lines of heights
+SHOWN, BESIDE_EACH_OTHER = 6, 3      # bodies on the page, as more columns do not fit; and bodies in one figure
+HEIGHT = (0.25, 0.30, 0.38)          # colour of the lines of heights: neutral, as they are beside the body
 BESIDE = 0.045                       # metres between the lines of heights
 
 
-def measures_page(names: Sequence[str], bodies: Sequence[np.ndarray], found: Sequence[Measurements], tapes: Tapes,
+def measures_page(names: Sequence[str], bodies: Sequence[np.ndarray], measured: Sequence[Measurements], tapes: Tapes,
                   sex: Sex | None = None) -> Page:
-    """The page of `scape measure`, of bodies (N, 3) as they were measured, compared with people of a sex."""
+    """Build the page of `scape measure`, of bodies (N, 3) as measured, compared with people of a sex."""
     several = f"{len(names)} bodies" if len(names) > 1 else names[0]
     page = Page(f"{several}, measured", "Where the tape ran on each body. Metres in the table file, millimetres here; "
                 "the weight is in kilograms.")
     shown = range(min(SHOWN, len(names)))
     for first in shown[::BESIDE_EACH_OTHER]:
-        few = shown[first:first + BESIDE_EACH_OTHER]
-        told = "" if first else ("Red: girths, a tape that spans hollows. Blue: lengths along the skin and widths. "
+        group = shown[first:first + BESIDE_EACH_OTHER]
+        caption = "" if first else ("Red: girths, a tape that spans hollows. Blue: lengths along the skin and widths. "
                                  "Grey, beside the body: heights. Drag to turn; the list hides and shows them.")
-        page.bodies([_pane(names[k], bodies[k], found[k], tapes, len(few) == 1) for k in few], told,
-                    560 if len(few) < 3 else 420)
+        page.bodies([_pane(names[k], bodies[k], measured[k], tapes, len(group) == 1) for k in group], caption,
+                    560 if len(group) < 3 else 420)
     if len(names) > SHOWN:
         page.text(f"The first {SHOWN} of {len(names)} bodies; all are in the table file.")
-    page.table([(_words(both), *(_cell(found[k], both, sex) for k in shown)) for both in _pairs()
-                if any(name in found[k].readings for k in shown for name in both)],
+    page.table([(_words(both), *(_cell(measured[k], both, sex) for k in shown)) for both in _pairs()
+                if any(name in measured[k].readings for k in shown for name in both)],
                ("mm", *(names[k] for k in shown)))
     if sex:
         page.text(f"In brackets: the percentile among {survey(sex).people:,} {WORDS[sex]} of ANSUR II, the survey of "
                   "US Army personnel of 2012. Soldiers are leaner and younger than everybody. "
                   "Measures that the survey took in another way have none.")
     notes = [(names[k], line) for k in shown for line in (
-        *found[k].turned, *(f"no {name.replace('_', ' ')}: {why}" for name, why in found[k].missing.items()))]
+        *measured[k].turned, *(f"no {name.replace('_', ' ')}: {why}" for name, why in measured[k].missing.items()))]
     if notes:
         page.section("To be looked at").table(notes)
     page.section("How it is measured").text(
@@ -61,7 +61,7 @@ def measures_page(names: Sequence[str], bodies: Sequence[np.ndarray], found: Seq
 
 
 def likely_section(page: Page, made: WantedBody) -> Page:
-    """What is likely of the measurements that nobody asked for."""
+    """Add the likely values of measurements that were not asked for."""
     who = WORDS[made.sex] if made.sex else "people"
     return page.section("What was not asked for").text(
         f"Of the {who} that the model knows, those who have what was asked for: what is most likely, which is this "
@@ -72,41 +72,43 @@ def likely_section(page: Page, made: WantedBody) -> Page:
 
 
 def _pairs() -> list[tuple[str, ...]]:
-    """The measurements, left and right together."""
+    """List the measurements, left and right together."""
     return [(name, name.replace("_left", "_right")) if name.endswith("_left") else (name,) for name in CATALOGUE
             if not name.endswith("_right")]
 
 
-def _words(both: tuple[str, ...]) -> str:
-    """As a table has it, in one line."""
-    return both[0].replace("_left", ", left / right").replace("_", " ").replace(" ", "\u00a0")
+def _words(sides: tuple[str, ...]) -> str:
+    """Return names as they are in the table, in one line."""
+    return sides[0].replace("_left", ", left / right").replace("_", " ").replace(" ", "\u00a0")
 
 
 def _number(name: str, value: float) -> str:
-    """Millimetres without their name, which is in the head of the table; kilograms with it."""
+    """Return millimetres without unit, which is in the head of the table; kilograms with it."""
     return CATALOGUE[name].text(value).removesuffix(" mm")
 
 
-def _cell(mine: Measurements, both: tuple[str, ...], sex: Sex | None) -> str:
-    """Millimetres of one measurement, or of left and right, with the percentile among people of a sex."""
-    shares = percentiles(mine.values, sex) if sex else {}
+def _cell(read: Measurements, sides: tuple[str, ...], sex: Sex | None) -> str:
+    """Return one measurement, or left and right, with percentiles among people of a sex."""
+    shares = percentiles(read.values, sex) if sex else {}
 
     def text(name: str) -> str:
-        if name not in mine.values:
+        """Return one value with its expected error and percentile."""
+        if name not in read.values:
             return "–"
-        error = f" ± {_number(name, mine.errors[name])}" if name in mine.errors else ""
-        return f"{_number(name, mine.values[name])}{error}" + (f" ({ordinal(shares[name])})" if name in shares else "")
+        error = f" ± {_number(name, read.errors[name])}" if name in read.errors else ""
+        return f"{_number(name, read.values[name])}{error}" + (f" ({ordinal(shares[name])})" if name in shares else "")
 
-    return " / ".join(map(text, both))
+    return " / ".join(map(text, sides))
 
 
-def _pane(name: str, vertices: np.ndarray, mine: Measurements, tapes: Tapes, labelled: bool) -> Pane:
-    """A body with its tapes; the lines of heights stand beside it, with their names where there is room."""
+def _pane(name: str, vertices: np.ndarray, measured: Measurements, tapes: Tapes, labelled: bool) -> Pane:
+    """Draw a body with its tapes; the lines of heights are beside it, named where there is room."""
     mesh = tapes.template.with_vertices(vertices)
-    up, left, ahead = mine.axes
+    up, left, ahead = measured.axes
     curves: dict[str, list[np.ndarray]] = {"girths": [], "lengths and widths": [], "heights": []}
     words, side = list[str](), float((vertices @ left).max()) + BESIDE
-    for term, reading in mine.readings.items():
+    # sort the tapes into kinds; each line of height goes a little further beside the body
+    for term, reading in measured.readings.items():
         tape, curve = tapes.found[term], reading.curve
         if isinstance(tape, Height):
             curve = curve + (side + len(words) * BESIDE - curve @ left)[:, None] * left
@@ -115,9 +117,9 @@ def _pane(name: str, vertices: np.ndarray, mine: Measurements, tapes: Tapes, lab
                else "lengths and widths"].append(curve)
     beside = curves["heights"]
     shapes: list[Shape] = [Solid(mesh, (0.86, 0.83, 0.79), name="body")]
-    for (what, some), color in zip(curves.items(), ((0.80, 0.20, 0.16), (0.10, 0.38, 0.66), HEIGHT), strict=True):
-        if some:
-            shapes.append(Bones(np.concatenate([c[:-1] for c in some]), np.concatenate([c[1:] for c in some]),
+    for (what, lines), color in zip(curves.items(), ((0.80, 0.20, 0.16), (0.10, 0.38, 0.66), HEIGHT), strict=True):
+        if lines:
+            shapes.append(Bones(np.concatenate([c[:-1] for c in lines]), np.concatenate([c[1:] for c in lines]),
                                 color, 0.003, name=what))
     if beside and labelled:
         shapes.append(Dots(np.array([c[-1] for c in beside]), HEIGHT, 0.008, labels=words))

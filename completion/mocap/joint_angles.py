@@ -1,8 +1,8 @@
-"""Joint angles as the International Society of Biomechanics (ISB) defines them, of a body that moves.
+"""Joint angles of a moving body as defined by the International Society of Biomechanics (ISB).
 
 Wu et al. 2002 (hip, ankle, spine), Wu et al. 2005 (shoulder, elbow, wrist), Grood and Suntay 1983 (knee). Axes of a
-segment point ahead (x), up or towards the trunk (y) and to the right (z). The table in the README has every joint with
-its zero, its signs and what stands in for landmarks that a skeleton does not have.
+segment point forward (x), up or towards the trunk (y) and to the right (z). The table in the README has every joint
+with its zero, its signs and substitutes for landmarks that a skeleton does not have.
 """
 from __future__ import annotations
 
@@ -17,7 +17,8 @@ from scanprep.skeleton.roles import above, find_numbered_roles
 
 from ..motion import Motion
 
-_SIDED = {                           # column without its side: (proximal segment, distal one, sequence, its signs)
+# names of the three angles without the side: (proximal segment, distal segment, sequence of axes, signs)
+_SIDED = {
     ("hip_flexion", "hip_adduction", "hip_rotation"): ("pelvis", "thigh", "zxy", (1, 1, 1)),
     ("knee_angle", "knee_adduction", "knee_rotation"): ("thigh", "shank", "zxy", (-1, 1, 1)),
     ("ankle_angle", "ankle_inversion", "ankle_rotation"): ("shank", "foot", "zxy", (1, 1, 1)),
@@ -28,17 +29,18 @@ _SIDED = {                           # column without its side: (proximal segmen
 _MIDDLE = {("pelvis_tilt", "pelvis_list", "pelvis_rotation"): ("ground", "pelvis", "zxy", (1, 1, 1)),
            ("lumbar_extension", "lumbar_bending", "lumbar_rotation"): ("pelvis", "trunk", "zxy", (1, 1, 1)),
            ("neck_extension", "neck_bending", "neck_rotation"): ("trunk", "head", "zxy", (1, 1, 1))}
+# segment: its proximal and distal joint
 _LIMBS = {"thigh": ("hip", "knee"), "shank": ("knee", "ankle"), "foot": ("ankle", None),
           "humerus": ("shoulder", "elbow"), "forearm": ("elbow", "wrist"), "hand": ("wrist", None)}
-_MIRROR = np.diag([1.0, 1.0, -1.0])  # a left joint as the right one that it mirrors
+_MIRROR = np.diag([1.0, 1.0, -1.0])  # turns a left joint into the right one that it mirrors
 
 
 @dataclass(frozen=True)
 class Joint:
-    """Three angles of one segment against another.
+    """Three angles of one segment relative to another.
 
-    `sequence` is of intrinsic rotations, `signs` make them the angles' own; a mirrored joint is turned to the other
-    side of the body before.
+    `sequence` has the axes of intrinsic rotations, `signs` turn these into the ISB angles. A mirrored joint is first
+    reflected to the other side of the body.
     """
 
     angles: tuple[str, str, str]
@@ -51,25 +53,25 @@ class Joint:
 
 @dataclass(frozen=True, eq=False)
 class SegmentAxes:
-    """The segments of a person at rest: the part that carries each and the axes (3, 3), columns ahead, up, right."""
+    """The segments of a person at rest: the part of each, and its axes (3, 3), columns forward, up, right."""
 
     axes: np.ndarray                 # of the whole body
     parts: dict[str, int]
     frames: dict[str, np.ndarray]
-    hips: tuple[int, ...]            # joints, of which the pelvis has its place
+    hips: tuple[int, ...]            # joints whose middle is the position of the pelvis
 
     def joints(self) -> list[Joint]:
-        """The joints whose two segments are there."""
+        """Return the joints whose two segments exist."""
         known = {"ground", *self.parts}
-        found = [Joint(names, *rest, False) for names, rest in _MIDDLE.items()]
-        found += [Joint((f"{a}_{side}", f"{b}_{side}", f"{c}_{side}"),
+        possible = [Joint(names, *rest, False) for names, rest in _MIDDLE.items()]
+        possible += [Joint((f"{a}_{side}", f"{b}_{side}", f"{c}_{side}"),
                         proximal if proximal in ("pelvis", "trunk") else f"{proximal}_{side}", f"{distal}_{side}",
                         sequence, signs, side == "l")
                   for side in "rl" for (a, b, c), (proximal, distal, sequence, signs) in _SIDED.items()]
-        return [joint for joint in found if {joint.proximal, joint.distal} <= known]
+        return [joint for joint in possible if {joint.proximal, joint.distal} <= known]
 
     def missing(self) -> tuple[str, ...]:
-        """Joints that people have and this body's parts do not, such as "knee_r"."""
+        """Return joints of people that this body does not have, such as "knee_r"."""
         known = {joint.distal for joint in self.joints()}
         wanted = ["trunk", "head", *(f"{name}_{side}" for side in "rl" for name in _LIMBS)]
         joint = {"trunk": "lumbar", "head": "neck"}
@@ -79,23 +81,23 @@ class SegmentAxes:
 
 @dataclass(frozen=True, eq=False)
 class JointAngles:
-    """The joint angles of a motion, and where the pelvis is, in the axes of the ground."""
+    """The joint angles of a motion, and the position of the pelvis, in the axes of the ground."""
 
     names: tuple[str, ...]
     degrees: np.ndarray              # (T, K)
     pelvis: np.ndarray               # (T, 3) metres, the middle of the hips
     ground: np.ndarray               # (3, 3) columns: its x, y (up) and z in the axes of the motion
-    missing: tuple[str, ...]         # joints that people have and this body's parts do not
-    guessed: tuple[str, ...] = ()    # angles of joints that the markers do not tell of, which are left out
+    missing: tuple[str, ...]         # joints of people that this body does not have
+    guessed: tuple[str, ...] = ()    # angles that the markers do not determine, which are left out
 
 
 def anatomy(names: tuple[str, ...], parents: np.ndarray, joints: np.ndarray) -> SegmentAxes:
-    """The segments of a person with joints (J, 3) at rest.
+    """Find the segments of a person with joints (J, 3), metres, at rest.
 
     Raises
     ------
     ValueError
-        Parts that have not the names of a person's.
+        Parts without the names of a person's.
     """
     roles = find_numbered_roles(names, joints)
     pair = next((p for p in (("l_hip", "r_hip"), ("l_shoulder", "r_shoulder")) if {*p} <= roles.keys()), None)
@@ -104,7 +106,7 @@ def anatomy(names: tuple[str, ...], parents: np.ndarray, joints: np.ndarray) -> 
     if "humanoid_root" not in roles or pair is None or not low or not high:
         raise ValueError(f"joint angles are of people: expected parts named pelvis, thigh_left, ..., head, found "
                          f"{', '.join(names)}"[:300])
-    # ahead, up and right: up is the axis of the model nearest to where the head is, right as level
+    # forward, up and right: up is the axis of the model nearest to the head, right is horizontal
     up = _nearest_axis(joints[high].mean(0) - joints[low].mean(0))
     right = joints[roles[pair[1]]] - joints[roles[pair[0]]]
     right = right - (right @ up) * up
@@ -123,7 +125,7 @@ def anatomy(names: tuple[str, ...], parents: np.ndarray, joints: np.ndarray) -> 
         parts["head"] = roles["skullbase"]
     frames = dict.fromkeys(parts, body)
 
-    # the segments of the limbs that have both their ends; without a joint beyond, they are as they are held at rest
+    # limb segments with both joints; the last ones, without a distal joint, have the axes of the rest pose
     for side, (name, (start, end)) in product("rl", _LIMBS.items()):
         begin, stop = roles.get(f"{side}_{start}"), roles.get(f"{side}_{end}")
         if begin is None or (end is not None and stop is None):
@@ -131,7 +133,7 @@ def anatomy(names: tuple[str, ...], parents: np.ndarray, joints: np.ndarray) -> 
         frame = body if name == "foot" else frames.get(f"forearm_{side}")
         if stop is not None:
             frame = _long_axes(joints[begin] - joints[stop], body, by_front=start in ("shoulder", "elbow"))
-            if name == "forearm":                            # thumbs point ahead at rest: half way to pronation
+            if name == "forearm":                            # thumbs point forward at rest: midway to pronation
                 frame = frame @ _turn(1, np.pi / 2 if side == "r" else -np.pi / 2)
         if frame is not None:
             parts[f"{name}_{side}"], frames[f"{name}_{side}"] = begin, frame
@@ -139,7 +141,7 @@ def anatomy(names: tuple[str, ...], parents: np.ndarray, joints: np.ndarray) -> 
 
 
 def _long_axes(long: np.ndarray, body: np.ndarray, by_front: bool) -> np.ndarray:
-    """(3, 3) columns: y along a bone, towards the trunk, and x as far ahead or z as far right as that leaves."""
+    """Build axes (3, 3), columns: y along a bone, towards the trunk; x forward, or z right, as far as y allows."""
     y = long / np.linalg.norm(long)
     kept = body[:, 0 if by_front else 2]
     kept = kept - (kept @ y) * y
@@ -149,36 +151,37 @@ def _long_axes(long: np.ndarray, body: np.ndarray, by_front: bool) -> np.ndarray
 
 def anatomical_angles(motion: Motion, subject: Subject, centres: np.ndarray, told: np.ndarray | None = None
                       ) -> JointAngles:
-    """The joint angles of a person in motion, whose joints are at `centres` (T, J, 3), metres.
+    """Compute the joint angles of a person in motion, whose joints are at `centres` (T, J, 3), metres.
 
-    With `told` (J,) bool only those between parts of which the markers tell.
+    With `told` (J,) bool, only angles between parts that the markers determine.
 
     Raises
     ------
     ValueError
-        A body whose parts have not the names of a person's.
+        A body whose parts lack the names of a person's.
     """
     skeleton = subject.skeleton
-    found = anatomy(skeleton.names, skeleton.parents, rest_joints(subject))
+    segments = anatomy(skeleton.names, skeleton.parents, rest_joints(subject))
     R = skeleton.part_rotations(motion.poses)
-    ground = ground_axes(found.axes, R[:, found.parts["pelvis"]])
-    degrees = angles_of(found, ground, R)
-    pelvis = centres[:, list(found.hips or (found.parts["pelvis"],))].mean(axis=1) @ ground
-    joints = found.joints()
-    known = [told is None or all(told[found.parts[segment]] for segment in (joint.proximal, joint.distal)
+    ground = ground_axes(segments.axes, R[:, segments.parts["pelvis"]])
+    degrees = angles_of(segments, ground, R)
+    pelvis = centres[:, list(segments.hips or (segments.parts["pelvis"],))].mean(axis=1) @ ground
+    # separate determined angles from guessed ones
+    joints = segments.joints()
+    known = [told is None or all(told[segments.parts[segment]] for segment in (joint.proximal, joint.distal)
                                  if segment != "ground") for joint in joints]
     names, guessed = (tuple(name for joint, is_known in zip(joints, known, strict=True) if is_known == wanted
                             for name in joint.angles) for wanted in (True, False))
-    return JointAngles(names, degrees[:, np.repeat(known, 3)], pelvis, ground, found.missing(), guessed)
+    return JointAngles(names, degrees[:, np.repeat(known, 3)], pelvis, ground, segments.missing(), guessed)
 
 
 def rest_joints(subject: Subject) -> np.ndarray:
-    """(J, 3) metres: the joints of a person at rest."""
+    """Compute the joints (J, 3) of a person at rest, metres."""
     return subject.joints(np.zeros((len(subject.skeleton.parents), 3)))
 
 
 def angles_of(found: SegmentAxes, ground: np.ndarray, R: np.ndarray) -> np.ndarray:
-    """(T, K) degrees, of part rotations (T, J, 3, 3): those of the joints one after the other, three each."""
+    """Compute joint angles (T, K), degrees, from part rotations (T, J, 3, 3), three for each joint in order."""
     columns = []
     for joint in found.joints():
         relative = _axes_of(found, ground, R, joint.proximal).swapaxes(1, 2) @ _axes_of(found, ground, R, joint.distal)
@@ -189,18 +192,19 @@ def angles_of(found: SegmentAxes, ground: np.ndarray, R: np.ndarray) -> np.ndarr
 
 
 def _axes_of(found: SegmentAxes, ground: np.ndarray, R: np.ndarray, segment: str) -> np.ndarray:
+    """Compute the axes (T, 3, 3) of a segment, or of the ground, in the world."""
     return np.broadcast_to(ground, R[:, 0].shape) if segment == "ground" else \
         R[:, found.parts[segment]] @ found.frames[segment]
 
 
 def ground_axes(axes: np.ndarray, R: np.ndarray) -> np.ndarray:
-    """(3, 3) columns x, y, z of OpenSim's ground, each an axis of the motion: y is up, x where the person faces.
+    """Find the axes (3, 3) of OpenSim's ground, columns x, y, z: y is up, x is where the person faces.
 
-    Of a body with `axes` (3, 3) at rest whose root has the rotations R (T, 3, 3); what counts is the mean, and of
-    somebody who turns round the first frame.
+    Each is an axis of the motion. The body has `axes` (3, 3) at rest, its root the rotations R (T, 3, 3). The mean
+    orientation counts, and for somebody who turns round the first frame.
     """
     mean = R.mean(axis=0)
-    # who leans no further on average stands by the model's own axes
+    # 0.6: a person who leans less than 53 degrees on average stands along the model's own up axis
     up = axes[:, 1] if (mean @ axes[:, 1]) @ axes[:, 1] > 0.6 else _nearest_axis(mean @ axes[:, 1])
     ways = [way - (way @ up) * up for way in (mean @ axes[:, 0], R[0] @ axes[:, 0], R[0] @ axes[:, 1])]
     x = _nearest_axis(next((way for way in ways if np.linalg.norm(way) > 0.1), ways[-1]))
@@ -208,16 +212,16 @@ def ground_axes(axes: np.ndarray, R: np.ndarray) -> np.ndarray:
 
 
 def _nearest_axis(direction: np.ndarray) -> np.ndarray:
+    """Return the signed coordinate axis nearest to a direction (3,)."""
     main = int(np.abs(direction).argmax())
     return np.eye(3)[main] * np.sign(direction[main])
 
 
 def decompose(R: np.ndarray, sequence: str) -> np.ndarray:
-    """(T, 3) radians: angles about the axes of a sequence, "zxy" or "yxy", whose rotations give R (T, 3, 3).
+    """Decompose rotations R (T, 3, 3) into angles (T, 3), radians, about the axes of a sequence, "zxy" or "yxy".
 
-    R = R_1(a) R_2(b) R_3(c). Of "yxy" it is the solution with -b between 0 and half a turn, as ISB has it; of the two
-    of "zxy" that of the smaller angles, unless it would jump. None jumps by a full turn. Where the first and the third
-    axis are one, a stays as it was.
+    R = R_1(a) R_2(b) R_3(c). For "yxy", -b is between 0 and half a turn, as in ISB. "zxy" has two solutions: smaller
+    angles are taken, unless that makes a jump. No angle jumps by a full turn. In gimbal lock, a stays as it was.
     """
     if sequence == "zxy":
         lost = np.hypot(R[:, 0, 1], R[:, 1, 1])
@@ -225,6 +229,7 @@ def decompose(R: np.ndarray, sequence: str) -> np.ndarray:
     else:
         lost = np.hypot(R[:, 0, 1], R[:, 2, 1])
         a, b = np.arctan2(-R[:, 0, 1], -R[:, 2, 1]), -np.arctan2(lost, R[:, 1, 1])
+    # in gimbal lock take a from the last frame in which it is defined
     known = np.maximum.accumulate(np.where(lost > 1e-9, np.arange(len(R)), -1))
     a = np.where(known < 0, 0.0, a[known])
     left = _turn(0, -b) @ _turn(2 if sequence == "zxy" else 1, -a) @ R
@@ -233,10 +238,10 @@ def decompose(R: np.ndarray, sequence: str) -> np.ndarray:
 
 
 def _smaller(angles: np.ndarray) -> np.ndarray:
-    """Of each frame's two solutions that of smaller angles (T, 3), radians; the least jumps are worth as much."""
+    """Choose between the two solutions of each frame: small angles (T, 3), radians, and small jumps (Viterbi)."""
     both = np.stack([angles, angles * [1, -1, 1] + np.pi])               # (2, T, 3)
     both -= 2 * np.pi * np.rint(both / (2 * np.pi))
-    # a frame's angles count little against a jump
+    # 0.05: cost of large angles, small against that of a jump
     size = 0.05 * np.abs(both).sum(axis=2)
     jump = np.abs(np.exp(1j * both[:, None, 1:]) - np.exp(1j * both[None, :, :-1])).sum(axis=3)      # (2, 2, T - 1)
     cost, came = size[:, 0].tolist(), np.zeros((len(angles), 2), dtype=int)
@@ -245,6 +250,7 @@ def _smaller(angles: np.ndarray) -> np.ndarray:
         stay, back, onward, remain = cost[0] + a, cost[1] + c, cost[0] + b, cost[1] + d
         came[t] = back < stay, remain < onward
         cost = [min(stay, back) + first, min(onward, remain) + second]
+    # trace the choices back from the last frame
     state, out = int(cost[1] < cost[0]), np.empty_like(angles)
     for t in range(len(angles) - 1, -1, -1):
         out[t], state = both[state, t], came[t, state]
@@ -252,5 +258,5 @@ def _smaller(angles: np.ndarray) -> np.ndarray:
 
 
 def _turn(axis: int, angle: np.ndarray | float) -> np.ndarray:
-    """(..., 3, 3) the rotations by angles (...), radians, about an axis."""
+    """Compute rotations (..., 3, 3) by angles (...), radians, about a coordinate axis."""
     return rotations.exp(np.asarray(angle)[..., None] * np.eye(3)[axis])

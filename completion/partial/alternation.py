@@ -1,10 +1,10 @@
-"""Eq. 10 as the paper solves it: rotations of the parts, surface and shape in turns.
+"""Solve [SCAPE] Eq. 10 as the paper does: rotations of the parts, surface and shape in turns.
 
-The energy is E_H[Y] + w_Z Σ |y_l - z_l|². Each block is a linear least-squares problem while the others are held, and
-the joint angles follow from the rotations afterwards. The variant of the patent, in which a kinematic chain of joint
-angles replaces the rotations, so that moving one joint carries all that hangs on it and changes its own Q, is what
-the default method does: its unknowns are the pose parameters, and `model.linear.PointOperator.jacobian` holds the
-derivative of the chain [SCAPE-patent §0090-0091].
+The energy is E_H[Y] + w_Z Σ |y_l - z_l|². Each block is a linear least-squares problem while the others are fixed, and
+the joint angles follow from the rotations afterwards. The patent has a variant in which joint angles of a kinematic
+chain replace the rotations: moving one joint then carries all parts below it and changes its own Q. The default method
+does that: its unknowns are the pose parameters, and `model.linear.PointOperator.jacobian` holds the derivative of the
+chain [SCAPE-patent §0090-0091].
 """
 from __future__ import annotations
 
@@ -28,11 +28,11 @@ from scanprep.skeleton.tree import Skeleton
 from .free_surface import FreeSurface
 from .settings import CompletionConfig
 
-MORE = 3                             # times as many rounds as the joint method: each block gives way only a little
+MORE = 3                             # times the rounds of the joint method: each block moves only a little in a round
 
 
 def turns_of(body: BodyModel | Subject, config: CompletionConfig) -> Callable[..., Solved]:
-    """The solver in turns; refused for a body that is not made of R, S and Q triangle by triangle, or without scale."""
+    """Return the alternating solver; ValueError for a body without R, S and Q per triangle, or for a free scale."""
     if config.method != "alternation":
         raise ValueError(f"method: expected 'joint' or 'alternation', got {config.method!r}")
     if config.free_scale:
@@ -46,16 +46,16 @@ def turns_of(body: BodyModel | Subject, config: CompletionConfig) -> Callable[..
 
 @dataclass(frozen=True, eq=False)
 class Markers:
-    """The measured points of Eq. 10."""
+    """Measured points of [SCAPE] Eq. 10."""
 
-    vertices: np.ndarray    # (L,) int, y_l is one of the vertices
+    vertices: np.ndarray    # (L,) int, the vertex y_l of each
     points: np.ndarray      # (L, 3), metres, z_l
     weights: np.ndarray     # (L,), w_Z of each
 
 
 @dataclass(frozen=True, eq=False)
 class Blocks:
-    """The variables of Eq. 10."""
+    """Unknowns of [SCAPE] Eq. 10."""
 
     R: np.ndarray           # (J, 3, 3), rotations of the parts
     Y: np.ndarray           # (N, 3), metres
@@ -63,7 +63,7 @@ class Blocks:
 
 
 class Alternation:
-    """The three steps for one model."""
+    """The three steps of the alternation for one model."""
 
     def __init__(self, model: ScapeModel) -> None:
         self.model, self.skeleton = model, model.skeleton
@@ -76,21 +76,21 @@ class Alternation:
         return np.ascontiguousarray(self.model.shape_space.components)
 
     def deform_edges(self, R: np.ndarray) -> np.ndarray:
-        """`Q v̂` (F, 2, 3) for rotations (J, 3, 3), from the joint angles between them."""
+        """Compute the edges `Q v̂` (F, 2, 3) for rotations (J, 3, 3), from the joint angles between them."""
         Q = self.model.pose_space.gradients(self.skeleton.pose_of(R))
         return self.v_hat @ np.swapaxes(Q, -1, -2)
 
     def shape(self, betas: np.ndarray) -> np.ndarray:
-        """S (F, 3, 3); a model without components means the template's own body."""
+        """Compute S (F, 3, 3) for betas (K,); a model without shape components has its template's own body."""
         return self.model.shape_space.gradients(betas if len(betas) else None)
 
     def predict(self, R: np.ndarray, betas: np.ndarray) -> np.ndarray:
-        """The minimum Ŷ (N, 3) of E_H, the root's joint in the origin."""
+        """Compute the minimum Ŷ (N, 3) of E_H, metres, with the root's joint at the origin."""
         turned = R[self.part] @ self.shape(betas)
         return self.model.stitching.stitch(self.deform_edges(R) @ np.swapaxes(turned, -1, -2))
 
     def solve_rotations(self, now: Blocks, w_T: float) -> Blocks:
-        """R for fixed Y and betas, Q held, neighbouring twists damped.
+        """Solve for R with Y, betas and Q fixed; differences between neighbouring twists are damped.
 
         [SCAPE] Eq. 11
         """
@@ -99,7 +99,7 @@ class Alternation:
         return Blocks(rotations.exp(t) @ now.R, now.Y, now.betas)
 
     def solve_vertices(self, now: Blocks, markers: Markers) -> Blocks:
-        """Y for fixed R and betas.
+        """Solve for Y with R and betas fixed.
 
         [SCAPE] Eq. 10
         """
@@ -109,12 +109,13 @@ class Alternation:
         return Blocks(now.R, Y, now.betas)
 
     def solve_shape(self, now: Blocks) -> Blocks:
-        """Betas for fixed R and Y: a quadratic function in which R cancels.
+        """Solve for the betas with R and Y fixed: linear least squares, as R⁻¹ brings the edges back to the part.
 
         [SCAPE] §6
         """
         if not len(now.betas):
             return now
+        # Σ |S(β) Q v̂ - Rᵀ v|² with S = Uβ + μ: the design matrix U q and the right side Rᵀ v - μ q
         q = np.swapaxes(self.deform_edges(now.R), -1, -2)                                                   # (F, 3, 2)
         U = (self._components @ q.astype(self._components.dtype)).reshape(len(now.betas), -1)
         wanted = np.swapaxes(edges(now.Y, self.model.template.faces) @ now.R[self.part], -1, -2)      # Rᵀ v
@@ -124,7 +125,7 @@ class Alternation:
         return Blocks(now.R, now.Y, betas)
 
     def energy(self, now: Blocks, markers: Markers) -> float:
-        """E_H[Y] + w_Z Σ |y_l - z_l|².
+        """Compute E_H[Y] + w_Z Σ |y_l - z_l|².
 
         [SCAPE] Eq. 10
         """
@@ -135,14 +136,14 @@ class Alternation:
 
 
 def solve_twists(skeleton: Skeleton, part: np.ndarray, e: np.ndarray, v: np.ndarray, w_T: float) -> np.ndarray:
-    """Twists (J, 3) that turn the edges e of every part onto v, neighbours alike.
+    """Solve for twists t (J, 3), radians, that turn the edges e of every part onto v, similar for neighbours.
 
-    Minimises Σ |(I + t̂) e - v|² + w_T Σ_adj |t_a - t_b|².
-
-    `part` (F,) int; `e, v` (F, 2, 3), metres; `w_T` square metres.
+    Minimises Σ |(I + t̂) e - v|² + w_T Σ_adj |t_a - t_b|². `part` (F,) int is the part of each triangle; `e` and `v`
+    are (F, 2, 3), metres; `w_T` is in square metres.
 
     [SCAPE] Eq. 11
     """
+    # data: t̂ e = -[e] t, so each triangle adds [e]ᵀ[e] to the block of its part and e × v to the right side
     J = len(skeleton.parents)
     block = np.einsum("fjd,fjd->f", e, e)[:, None, None] * np.eye(3) - np.swapaxes(e, -1, -2) @ e   # [e]ᵀ[e]
     right = np.cross(e, v).sum(axis=1)
@@ -151,6 +152,7 @@ def solve_twists(skeleton: Skeleton, part: np.ndarray, e: np.ndarray, v: np.ndar
     own = np.zeros((J, 3, 3))
     np.add.at(own, part, block)
     normal[np.arange(J), :, np.arange(J), :] = own
+    # damping: w_T (t_j - t_p) for every joint between a part j and its parent p
     for j in range(1, J):
         p = skeleton.parents[j]
         for a, b, sign in ((j, j, 1), (p, p, 1), (j, p, -1), (p, j, -1)):
@@ -160,13 +162,16 @@ def solve_twists(skeleton: Skeleton, part: np.ndarray, e: np.ndarray, v: np.ndar
 
 def solve_in_turns(model: ScapeModel, surface_weight: float, fit: ScanFit, few: ScanFit, x: np.ndarray,
                    tell: Callable[[int], None]) -> Solved:
-    """As `solve_jointly`: in a round the points closest to Y[Z] become markers, then R, Y and betas are found in turns.
+    """Alternate over R, Y and betas; in every round the scan points closest to Y[Z] become markers.
+
+    Arguments and result are those of `solve_jointly`.
 
     [SCAPE] §7
     """
     config, steps = fit.config, Alternation(model)
     pose, _, betas = fit.body.split(x)
     now = Blocks(model.skeleton.part_rotations(pose), fit.body.vertices(x), betas)
+    # the limit on the distance of matches shrinks for half of the rounds, then stays
     rounds, shift = MORE * config.rounds, np.inf
     reaches = np.geomspace(REACH, FINAL_REACH, rounds)
     for i, reach in enumerate([*reaches, *[FINAL_REACH] * rounds]):
@@ -178,15 +183,16 @@ def solve_in_turns(model: ScapeModel, surface_weight: float, fit: ScanFit, few: 
         tell(min(1 + i // MORE, config.rounds))
         if i >= rounds and shift < SETTLED / MORE:
             break
+    # back to the unknowns of the joint method: joint angles, place, betas
     trans = model.stitching.root_weights @ now.Y - model.skeleton.joints[0]
     x = np.concatenate([model.skeleton.pose_of(now.R).ravel(), trans, now.betas])
     return Solved(x, bool(shift < SETTLED), i + 1, {"eq_10": steps.energy(now, markers)})
 
 
 def nearest_markers(fit: ScanFit, surface_weight: float, mesh: Mesh, reach: float) -> Markers:
-    """Closest points and landmarks as markers, weighted as in the joint method, in units of one point of the scan.
+    """Find the closest points, and return them with the landmarks as markers, weighted as in the joint method.
 
-    The weight of the setting is meant for all points of the scan; what is matched are fewer.
+    Weights are in units of one scan point. `surface_weight` is meant for all points of the scan; fewer are matched.
 
     [SCAPE] §7
     """

@@ -65,10 +65,12 @@ def complete_scan(scans: ScansArg = (), *, output: Output, model: ModelOrNone = 
     """
     if not scans and not interactive:
         raise UsageError("SCAN: expected at least one scan, or a folder of scans")
+    # two flags that are settings
     if unit == "unknown":
         config, unit = replace(config, free_scale=True), None
     if up is not None:
         config = replace(config, up=AXES[up])
+    # a folder: each scan by itself
     if len(scans) == 1 and scans[0].is_dir():
         if len(mask) > 1:
             raise UsageError(f"--mask: expected one folder of masks for a folder of scans, got {len(mask)}")
@@ -78,6 +80,7 @@ def complete_scan(scans: ScansArg = (), *, output: Output, model: ModelOrNone = 
         return _in_browser(scans, output, model, subject, template_landmarks, unit, config)
     loaded, name = read_model(model)
     inputs = CompletionInputs(scans, landmarks or landmarks_beside(scans[0]), mask)
+    # names of landmarks must be known on the template only if there are any
     marks = {} if inputs.landmarks is None else marks_of_template(loaded, template_landmarks, name)
     work = CompletionTask(body_of(loaded, subject, unit), name, marks, config, unit,
                           ColorConfig(fill=config.fill_colors))
@@ -89,7 +92,7 @@ def complete_scan(scans: ScansArg = (), *, output: Output, model: ModelOrNone = 
 
 
 def _mend(call: FolderCall, space: Workspace) -> Outcome:
-    """Look at what a folder was completed to, and mend it, in the browser."""
+    """Review and correct the results of a folder in the browser."""
     from scanprep.viewer.server import serve
 
     from .mend import CompletionsApp
@@ -106,14 +109,15 @@ def _mend(call: FolderCall, space: Workspace) -> Outcome:
 
 def _in_browser(scans: tuple[Path, ...], output: Path, model: Path | None, subject: str | None,
                 template_landmarks: Path | None, unit: Unit | None, config: CompletionConfig) -> Outcome:
-    """Complete scans by hand in the browser."""
+    """Complete scans in the browser."""
     from scanprep.viewer.server import serve
 
+    from .clicked_markers import is_recording, labels_of
     from .interactive import CompleteApp
-    from .worn import is_recording, labels_of
 
     loaded, name = read_model(model)
     marks = marks_of_template(loaded, template_landmarks, name)
+    # recordings among the files give labels of markers to click; the others are scans
     labels = [label for path in scans for label in labels_of(path)]
     scans = tuple(path for path in scans if not is_recording(path))
     files = [path for one in scans for path in ([task.scan for task in find_scans(one)] if one.is_dir() else [one])]

@@ -1,4 +1,4 @@
-"""A folder of scans for `scape complete`: what it was called with, its tasks, its page."""
+"""`scape complete` on a folder of scans: its arguments, its tasks, its page."""
 from __future__ import annotations
 
 from dataclasses import dataclass, field
@@ -26,7 +26,7 @@ from .work import EXPLAINED, MEANS, CompletionInputs, CompletionTask
 
 @dataclass(frozen=True)
 class FolderCall(KeptCall):
-    """What `scape complete` was called with for a folder of scans."""
+    """The arguments of `scape complete` for a folder of scans."""
 
     command: ClassVar[str] = "scape complete"
     may_be_files: ClassVar[tuple[str, ...]] = ("subject",)
@@ -40,7 +40,7 @@ class FolderCall(KeptCall):
     config: CompletionConfig = field(default_factory=CompletionConfig)
 
     def tasks(self) -> dict[str, Task]:
-        """The scans as they are now, by name, with their landmarks, in their folder or its own, and masks."""
+        """Return a task for each scan that is there now, by name, with its landmarks and mask."""
         if self.masks is not None and not self.masks.is_dir():
             raise UsageError("--mask: expected a folder of masks for a folder of scans, there is none at "
                              f"{self.masks}")
@@ -50,7 +50,7 @@ class FolderCall(KeptCall):
                 for scan in find_scans(self.scans, self.landmarks)}
 
     def work(self, wanted: bool) -> tuple[BodyModel, CompletionTask]:
-        """The model, and the work on each scan; `wanted`: landmarks of the template must be known."""
+        """Load the model and the shared settings; `wanted`: landmarks of the template must be known."""
         loaded, name = read_model(self.model)
         marks = marks_of_template(loaded, self.template_landmarks, name, wanted)
         return loaded, CompletionTask(body_of(loaded, self.subject, self.unit), name, marks, self.config, self.unit,
@@ -63,7 +63,7 @@ class FolderCall(KeptCall):
         return self.description(space.folder, work.model).carry_out("completing scans", space, work, tasks, workers)
 
     def description(self, output: Path, model: str) -> FolderCommand:
-        """What is said of the scans in an output; `model` is its name."""
+        """Return the wording of table and page for an output; `model` is the model's name."""
         return FolderCommand(
             ("scan",), "{} completed", summary, lambda rows: -figure(rows, EXPLAINED),
             {"complete": self.config, "model": model},
@@ -72,7 +72,7 @@ class FolderCall(KeptCall):
 
 
 def summary(results: Results, count: int) -> list[Metric]:
-    """The rows of the closing table."""
+    """Return the rows of the closing table: counts, and means over the scans."""
     rows = [Metric("scans completed", f"{len(results.values)} of {count}"),
             Metric("of them in this run", len(results.fresh))]
     for name in MEANS:

@@ -1,4 +1,4 @@
-"""The free surface: it follows the scan where there are data, and keeps the model's shape where there are none."""
+"""Free surface: follows the scan where there are data, and keeps the model's shape where there are none."""
 from __future__ import annotations
 
 import numpy as np
@@ -12,15 +12,14 @@ from scanprep.geometry.surface import Surface
 
 from .settings import CompletionConfig
 
-NEAR, ROUNDS = 0.03, 4              # metres: limit on the distance of scan points to the free surface; its matchings
+NEAR, ROUNDS = 0.03, 4              # metres: largest distance of a match; rounds of matching
 
 
 class FreeSurface:
-    """The surface that follows data, and where there are none keeps to the shape the model predicts.
+    """Surface that follows data, and keeps the predicted shape elsewhere.
 
-    The model's own energy E_H has its minimum at the predicted vertices, and it is quadratic with the
-    matrix L = GᵀG of the triangulation, so E_H[Y] = E_H[Ŷ] + tr (Y - Ŷ)ᵀ L (Y - Ŷ) holds exactly: neither
-    R, S nor Q are needed again.
+    The energy E_H has its minimum at the predicted vertices Ŷ. It is quadratic with the matrix L = GᵀG of the
+    triangulation, so E_H[Y] = E_H[Ŷ] + tr (Y - Ŷ)ᵀ L (Y - Ŷ) holds exactly, and R, S and Q are not needed again.
     """
 
     def __init__(self, mesh: Mesh) -> None:
@@ -29,15 +28,24 @@ class FreeSurface:
 
     def solve(self, predicted: np.ndarray, weights: csr_array, targets: np.ndarray, data_weight: np.ndarray
               ) -> np.ndarray:
-        """Vertices (N, 3) that minimise E_H[Y] + w_Z Σ |y_l - z_l|².
+        """Compute the vertices Y (N, 3), metres, that minimise E_H[Y] + w_Z Σ |y_l - z_l|².
 
-        `predicted` (N, 3), metres, the model's vertices Ŷ, the minimum of E_H; `weights` (L, N) sparse; `targets`
-        (L, 3), metres, where they were measured, z_l; `data_weight` (L,), w_Z for each.
+        Parameters
+        ----------
+        predicted : (N, 3) float, metres
+            The model's vertices Ŷ, the minimum of E_H.
+        weights : (L, N) sparse
+            Each row takes the vertices to a point y_l of the surface.
+        targets : (L, 3) float, metres
+            Measured points z_l.
+        data_weight : (L,) float
+            w_Z of each point.
 
         [SCAPE] Eq. 10
         """
         if not len(targets):
             return predicted
+        # normal equations of the offset Y - Ŷ; the tiny diagonal fixes components of the mesh without data
         measured = csc_array(weights.T * data_weight[None, :])
         tiny = 1e-9 * coo_array((np.ones(self.count), (np.arange(self.count),) * 2))
         solve = sparse.factor(csc_array(self.matrix + measured @ weights + tiny))
@@ -45,7 +53,7 @@ class FreeSurface:
 
 
 def edge_matrix(faces: np.ndarray, count: int) -> csc_array:
-    """L = GᵀG (N, N), where G takes the vertices to the two edges of every triangle from its first vertex.
+    """Build L = GᵀG (N, N), where G takes the vertices to the two edges of every triangle from its first vertex.
 
     [SCAPE] Eq. 2
     """
@@ -57,30 +65,32 @@ def edge_matrix(faces: np.ndarray, count: int) -> csc_array:
 
 def free_surface(predicted: Mesh, cloud: ScanPoints, config: CompletionConfig
                  ) -> tuple[Mesh, np.ndarray, np.ndarray, float]:
-    """The completed mesh, its seen vertices (N,), the scan points used (n,) and their RMS distance to it.
+    """Return the completed mesh, its observed vertices (N,), the used scan points (n,) and their RMS distance, metres.
 
     [SCAPE] Eq. 10
     """
     solver = FreeSurface(predicted)
     mesh = predicted
+    # closest points on the surface so far, if they are near and face the same way, then a new surface
     for _ in range(ROUNDS):
-        found = Surface(mesh).closest(cloud.points)
-        agree = np.einsum("nd,nd->n", mesh.face_normals[found.faces], cloud.normals) > MIN_COSINE
-        used = agree & (found.distances < NEAR)
-        weights = _rows(predicted, found.faces[used], found.bary[used])
+        closest = Surface(mesh).closest(cloud.points)
+        agree = np.einsum("nd,nd->n", mesh.face_normals[closest.faces], cloud.normals) > MIN_COSINE
+        used = agree & (closest.distances < NEAR)
+        weights = _rows(predicted, closest.faces[used], closest.bary[used])
         mesh = predicted.with_vertices(solver.solve(predicted.vertices, weights, cloud.points[used],
                                                     np.full(used.sum(), config.surface_weight)))
+    # a vertex was observed when a used point lies on one of its triangles
     seen = np.zeros(len(predicted.vertices), dtype=bool)
-    seen[predicted.faces[found.faces[used]]] = True
+    seen[predicted.faces[closest.faces[used]]] = True
     return mesh, seen, used, distance_to(mesh, cloud.points[used])
 
 
 def distance_to(mesh: Mesh, points: np.ndarray) -> float:
-    """Root mean square distance of points (n, 3) to a mesh, metres; NaN without points."""
+    """Compute the root mean square distance of points (n, 3) to a mesh, metres; NaN without points."""
     return float(np.sqrt((Surface(mesh).closest(points).distances**2).mean())) if len(points) else np.nan
 
 
 def _rows(mesh: Mesh, faces: np.ndarray, bary: np.ndarray) -> csr_array:
-    """(L, N) sparse weights of points on triangles."""
+    """Build the sparse matrix (L, N) that takes vertices to points on triangles."""
     rows = np.repeat(np.arange(len(faces)), 3)
     return csr_array((bary.ravel(), (rows, mesh.faces[faces].ravel())), shape=(len(faces), len(mesh.vertices)))

@@ -1,4 +1,4 @@
-"""`scape complete --interactive`: click a few landmarks on a scan, complete, look, correct, complete again, save.
+"""`scape complete --interactive`: click landmarks on a scan, complete, look, correct, complete again, save.
 
 Built on `scape pick`: the template is the model's, with its landmarks, and a third pane shows the whole body.
 """
@@ -29,6 +29,7 @@ from scanprep.viewer.pick import PickApp
 from scanprep.viewer.surface_clicks import Clickable
 
 from .clicked_landmarks import far_apart_first, helpful, landmark_doubts, on_scan, pairs_of
+from .clicked_markers import extra_markers, labels_of, write_clicked_markers
 from .completion import Completion, complete
 from .report import completion_panes
 from .work import (
@@ -42,11 +43,10 @@ from .work import (
     read_scan_views,
     write_results,
 )
-from .worn import extra_markers, labels_of, write_worn
 
-ENDING = ".landmarks.json"           # of landmark files
+ENDING = ".landmarks.json"           # of landmark files beside a scan
 COMPLETED = "completed.ply"
-FEWEST = 3                           # landmarks that say where a body is
+FEWEST = 3                           # landmarks that fix position and orientation of a body
 TOLD = {"good": "completed: look at it from all sides, then save; or move or add landmarks and complete again",
         "check": "completed, but look at it: move or add landmarks and complete again, or save",
         "failed": "the completion failed: correct landmarks, then start over"}
@@ -54,29 +54,32 @@ TOLD = {"good": "completed: look at it from all sides, then save; or move or add
 
 @dataclass(frozen=True, eq=False)
 class Made:
-    """A completion and what it was made from."""
+    """A completion and the inputs it was made from."""
 
     completion: Completion
     files: ScanFiles
-    seconds: float                       # that it took
+    seconds: float                       # run time
     places: Mapping[str, np.ndarray]     # of the landmarks
-    known: bool                          # whether the person's shape was
-    masked: np.ndarray | None = None     # points that were clothing or hair
+    known: bool                          # whether the person's shape was known
+    masked: np.ndarray | None = None     # (n,) points that are clothing or hair
     stale: bool = False                  # whether its scan or the settings have changed since
 
 
 class CompleteApp(PickApp):
-    """The state of `scape complete --interactive`.
+    """State of `scape complete --interactive`.
 
     Parameters
     ----------
     model : BodyModel
-    work : Work
-        Settings, and the landmarks of the model's template; its body is what a person of known shape is.
-    scans : paths
-    output : folder that results are saved in, one for each scan where there are several
-    labels : of markers that the person wears, to be clicked too
-    dropped : where scans that are dropped are kept, for as long as the app, unless it is somebody else's
+    work : CompletionTask
+        Settings and landmarks of the template; its body is used when the person's shape is known.
+    scans : sequence of Path
+    output : Path
+        Folder for the results, with a folder for each of several scans.
+    labels : strings, optional
+        Markers on the person, which can be clicked too.
+    dropped : Dropped, optional
+        Keeps scans that are dropped on the page; without it the app keeps them until it closes.
     """
 
     name, title = "complete", "Complete a scan"
@@ -90,12 +93,13 @@ class CompleteApp(PickApp):
         self.saved: dict[Path, Path] = {}
         self.known = isinstance(work.body, Subject)
         self.can_choose = model.n_betas > 0
+        # the template with its landmarks, those far apart first, and the scans
         template = Clicked(Path(work.model), output / "template.landmarks.json", surface=Clickable(model.template))
         marks = far_apart_first({name: model.template.vertices[vertex] for name, vertex in work.marks.items()})
         super().__init__(template, [self._load_clicked(path) for path in scans], labels, fixed=marks)
 
     def _load_clicked(self, path: Path) -> Clicked:
-        """A scan; of one that was dropped the landmarks are saved with the results."""
+        """Load a scan; landmarks of a dropped scan are saved with the results."""
         file = self.output / (name_of(path) + ENDING) if self.dropped.holds(path) else None
         one = Clicked.load(path, ENDING, self.work.unit, file if file and file.exists() else None)
         one.file = file or one.file
@@ -103,31 +107,32 @@ class CompleteApp(PickApp):
         return one
 
     def _load_input(self, path: Path) -> ScanFiles | DepthPicture:
-        """What is in a file, read when it is first wanted."""
+        """Read a file when it is first needed, and keep the content."""
         if path not in self._read:
             self._read[path] = read_picture([path], self.work.unit) or read_scan_views([path], self.work.unit)
         return self._read[path]
 
     def _surface(self, path: Path) -> Clickable | None:
-        """The first view of a scan; a depth picture has its own way to be shown."""
-        given = self._load_input(path)
-        if not isinstance(given, ScanFiles):
+        """Return the first view of a scan to click on; None for a depth picture, which is shown otherwise."""
+        content = self._load_input(path)
+        if not isinstance(content, ScanFiles):
             return None
-        view = given.views[0]
+        view = content.views[0]
         return Clickable(view if isinstance(view, Mesh) else view.points)
 
     def _inputs(self, scan: Clicked) -> CompletionInputs:
+        """Return the files of a scan: itself and its landmarks."""
         return CompletionInputs((scan.path,), scan.file)
 
     def _files(self, path: Path, pairs: tuple[np.ndarray, np.ndarray] | None) -> ScanFiles:
-        """The views of a scan; of a depth picture the person in it, whom landmarks tell from others."""
-        given = self._load_input(path)
-        return given if isinstance(given, ScanFiles) else person_in(given, self.model.template, pairs)
+        """Return the views of a scan; in a depth picture the person, which landmarks tell from other people."""
+        content = self._load_input(path)
+        return content if isinstance(content, ScanFiles) else person_in(content, self.model.template, pairs)
 
     # what the page is sent
 
     def scene(self) -> Message:
-        """The template, the scan, and the whole body once there is one."""
+        """Return the panes: the template, the scan, and the whole body once there is one."""
         panes = [self.template.pane("the model")]
         if self.scan is not None:
             panes.append(self.scan_pane())
@@ -136,17 +141,19 @@ class CompleteApp(PickApp):
         return Message("scene", {}, pack_scene(panes))
 
     def _result_pane(self) -> Pane | None:
+        """Return the pane of the completed body, None before there is one."""
         made = self.made.get(self.scan.path) if self.scan else None
         if made is None:
             return None
         return completion_panes(list(made.files.views), made.completion, self.model.template, made.masked)[-1]
 
     def _read_masks(self, scan: Clicked, files: ScanFiles) -> np.ndarray | None:
+        """Read which points of a scan (n,) are clothing or hair, None without masks."""
         masks = self._inputs(scan).masks
         return read_masks(masks, files, self.work.unit) if masks else None
 
     def more(self) -> dict[str, Any]:
-        """What the completion says of itself, and what would help it."""
+        """Return figures and judgement of the completion, and which landmarks would help it."""
         made = self.made.get(self.scan.path) if self.scan else None
         markers = extra_markers(self.scan.places, self.work.marks) if self.scan else {}
         out: dict[str, Any] = {"known": self.known, "can_choose": self.can_choose, "completed": None,
@@ -162,29 +169,31 @@ class CompleteApp(PickApp):
         return out
 
     def _figures(self, made: Made) -> list[Metric]:
+        """Return the rows of the closing table."""
         assert self.scan is not None
         pairs = pairs_of(made.places, self.work.marks)
         return completion_figures(self.work, self._inputs(self.scan), made.completion, pairs, made.masked)
 
     def _is_outdated(self, made: Made) -> bool:
-        """Whether landmarks, or anything else that it was made from, were changed since."""
+        """Tell whether landmarks or other inputs have changed since the completion."""
         assert self.scan is not None
         now = {name: self.scan.places[name] for name in self._usable(self.scan)}
         return made.stale or made.known != self.known or set(now) != set(made.places) or any(
             not np.array_equal(now[name], made.places[name]) for name in now)
 
     def _usable(self, scan: Clicked) -> list[str]:
+        """Return the names of clicked landmarks that the template has too."""
         return [name for name in self.work.marks if name in scan.places]
 
     # markers that the person wears
 
     def choose_next(self, last: str | None, pane: int = 1) -> None:
-        """Offer the next name, a landmark of the model or a marker, that the scan lacks."""
+        """Choose the next name, a landmark of the model or a marker, that the scan lacks."""
         done = set(self.scan.places) if self.scan else set()
         self.chosen = next_name(self.names, done, last) or last or next(iter(self.names), None)
 
     def on_choose(self, send: Send, name: str) -> None:
-        """A name, or all those of a marker set."""
+        """Choose a name, or add all names of a marker set."""
         labels = labels_of(" ".join(name.split()))
         if labels:
             self._join(labels)
@@ -192,6 +201,7 @@ class CompleteApp(PickApp):
             super().on_choose(send, name)
 
     def _join(self, labels: Sequence[str]) -> None:
+        """Add labels of markers to the names that can be clicked."""
         self.names = tuple(dict.fromkeys([*self.names, *labels]))
         done = self.scan.places if self.scan else {}
         self.chosen = next((label for label in labels if label not in done), self.chosen)
@@ -199,9 +209,9 @@ class CompleteApp(PickApp):
     # what the page sends
 
     def receive(self, name: str, path: Path, send: Send) -> None:
-        """A scan that was dropped on the page; it is completed beside the others, its landmarks saved with it.
+        """Take a file that was dropped on the page: a scan is shown beside the others.
 
-        Of a recording the labels of its markers, which are clicked on the scan then.
+        A recording of markers adds the labels of its markers, which can then be clicked on the scan.
         """
         with self.dropped.keeping(name, path) as kept:
             labels = labels_of(kept)
@@ -215,7 +225,7 @@ class CompleteApp(PickApp):
         send(self.state())
 
     def take(self, path: Path) -> None:
-        """Show one more scan, or the same anew in its place."""
+        """Show one more scan, or read a scan again in its place."""
         self._read.pop(path, None)
         one = self._load_clicked(path)
         _ = one.shown                                            # what cannot be shown is refused
@@ -227,14 +237,14 @@ class CompleteApp(PickApp):
             self.choose_next(None)
 
     def _predict_if_time(self, send: Send, pane: int) -> None:
-        """Here the completion tells where landmarks are."""
+        """Do nothing: here the completion predicts landmarks."""
 
     def on_known(self, send: Send, known: bool) -> None:
-        """Whether the body is the one that the model's poses were learned from."""
+        """Set whether the body is the one that the model's poses were learned from."""
         self.known = bool(known) or not self.can_choose
 
     def on_complete(self, send: Send, anew: bool = False) -> None:
-        """Complete the scan, going on from the body that there is, if that means anything; `anew` searches again."""
+        """Complete the scan, from the last result if that is meaningful; `anew` searches from scratch."""
         if self.scan is None:
             raise ValueError("drop a scan on the page first")
         if self.working is not None:
@@ -243,6 +253,7 @@ class CompleteApp(PickApp):
         if 0 < len(names) < FEWEST:
             raise ValueError(f"click at least {FEWEST} landmarks, or none")
         made = self.made.get(self.scan.path)
+        # go on from the last result if it is of the same kind and did not fail
         on = made is not None and made.known == self.known and names and not anew \
             and not self.work.config.free_scale and made.completion.judgement.verdict != "failed"
         start = made.completion if made is not None and on else None
@@ -263,7 +274,7 @@ class CompleteApp(PickApp):
         self.beside("completing", work, send, "this scan could not be completed")
 
     def on_doubt(self, send: Send) -> None:
-        """Find the body without the landmarks, which tells those that are at wrong places."""
+        """Complete without the landmarks, to find those at wrong places."""
         if self.scan is None or self.working is not None:
             return
         scan, known, places = self.scan, self.known, {name: self.scan.places[name] for name in self._usable(self.scan)}
@@ -275,21 +286,22 @@ class CompleteApp(PickApp):
                 return "the body is not found without landmarks either"
             with self._lock:
                 scan.predicted = on_scan(done, self.work.marks, scan.body)
-            told = landmark_doubts({name: done.scale * place for name, place in places.items()},
+            text = landmark_doubts({name: done.scale * place for name, place in places.items()},
                                    {name: done.completed.vertices[vertex] for name, vertex in self.work.marks.items()})
-            return told if done.judgement.verdict == "good" else f"{told}; but that body is itself doubtful"
+            return text if done.judgement.verdict == "good" else f"{text}; but that body is itself doubtful"
 
         self.beside("finding the body without the landmarks", work, send, "it could not be found")
 
     def _find_body(self, scan: Clicked, files: ScanFiles, known: bool, pairs: tuple[np.ndarray, np.ndarray] | None,
                    tell: Callable[[int, int], None], start: Completion | None = None
                    ) -> tuple[Completion, np.ndarray | None]:
-        """The body in a scan, and its points that are clothing or hair."""
-        given, masked = self._load_input(scan.path), self._read_masks(scan, files)
-        views = list(given.views) if isinstance(given, ScanFiles) else given
+        """Complete a scan; return the result and its points that are clothing or hair."""
+        content, masked = self._load_input(scan.path), self._read_masks(scan, files)
+        views = list(content.views) if isinstance(content, ScanFiles) else content
         return complete(self._body(known), views, pairs, self.work.config, tell, masked, start), masked
 
     def _body(self, known: bool) -> BodyModel | Subject:
+        """Return the model, or the person of known shape, the template's own body by default."""
         if not known:
             return self.model
         if not isinstance(self.work.body, Subject):
@@ -297,7 +309,7 @@ class CompleteApp(PickApp):
         return self.work.body
 
     def on_save(self, send: Send) -> None:
-        """Write what `scape complete` writes."""
+        """Write the files that `scape complete` writes."""
         made = self.made.get(self.scan.path) if self.scan else None
         if made is None or self.scan is None:
             raise ValueError("complete the scan first")
@@ -309,6 +321,7 @@ class CompleteApp(PickApp):
             self.working = None
 
     def _save(self, scan: Clicked, made: Made) -> None:
+        """Write the files of a scan into its folder."""
         folder = self.folder_of(scan)
         with workspace(folder) as space, space.staging("completion") as staged:
             self._write(scan, made, staged.folder)
@@ -316,19 +329,19 @@ class CompleteApp(PickApp):
         self.note = f"saved: {folder.absolute() / COMPLETED}, and beside it the pose, the shape and a page"
 
     def folder_of(self, scan: Clicked) -> Path:
-        """Where the body of a scan is saved."""
+        """Return the folder for the results of a scan."""
         return self.output if len(self.scans) == 1 else self.output / name_of(scan.path)
 
     def _write(self, scan: Clicked, made: Made, folder: Path) -> list[Metric]:
-        """All files of a completion into a folder; the figures."""
+        """Write all files of a completion into a folder and return the figures."""
         rows = write_results(replace(self.work, body=self._body(made.known)), self._inputs(scan), made.files,
                              made.completion, pairs_of(made.places, self.work.marks), made.masked, folder)
-        rows += write_worn(folder, made.completion, extra_markers(scan.places, self.work.marks))
+        rows += write_clicked_markers(folder, made.completion, extra_markers(scan.places, self.work.marks))
         rows += [Metric("completed", "in the browser"), Metric("shape", "known" if made.known else "found")]
         outcome = Outcome(folder, rows, {"complete": self.work.config}, judgement=made.completion.judgement)
         write_report(outcome, "scape complete --interactive", made.seconds)
         return rows
 
     def close(self) -> None:
-        """Forget files that were dropped."""
+        """Delete the files that were dropped."""
         self.dropped.close()

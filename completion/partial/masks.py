@@ -1,4 +1,4 @@
-"""Clothing and hair: points that hide the body, and the files that say which they are."""
+"""Masks: files that mark points of a scan as clothing or hair."""
 from __future__ import annotations
 
 import re
@@ -14,27 +14,28 @@ from scanprep.geometry.files import read_points
 
 
 def read_mask(path: str | Path, points: np.ndarray, unit: str | None = None) -> np.ndarray:
-    """Which points of a scan a file marks.
+    """Read which points of a scan a file marks.
 
     Parameters
     ----------
     path : path
         `.npy`, `.json` or `.txt` with one true, false, 1 or 0 for each point, or with the numbers of the marked
-        points; or a mesh or point cloud (PLY, PCD, OBJ, GLB) with points of the scan, where those are marked that
-        have a colour and not a grey: paint clothing in a colour over white, as MeshLab and Blender do.
+        points. Or a mesh or point cloud (PLY, PCD, OBJ, GLB) of the scan in which marked points have a colour that is
+        not grey: paint clothing in a colour over white, in MeshLab or Blender.
     points : (n, 3) float, metres
         Of the scan, one view after the other.
     unit : 'm', 'mm', 'cm' or 'in', optional
-        Of a mesh or cloud.
+        Of a mesh or point cloud.
 
     Returns
     -------
     (n,) bool
+        True for marked points.
 
     Raises
     ------
     ValueError
-        A file that is missing or holds something else: file, line or element, what was expected, what came.
+        A file that is missing or holds something else; the message names the file and the line or element.
     """
     path = Path(path)
     ending = path.suffix.lower()
@@ -52,7 +53,7 @@ def read_mask(path: str | Path, points: np.ndarray, unit: str | None = None) -> 
 
 
 def _plain(path: Path, values: Sequence[Any], what: str) -> np.ndarray:
-    """Booleans, or whole numbers, as an array of one type."""
+    """Convert booleans, or whole numbers, to an array of one type."""
     if values and all(isinstance(value, bool) for value in values):
         return np.array(values, dtype=bool)
     for i, value in enumerate(values):
@@ -64,6 +65,7 @@ def _plain(path: Path, values: Sequence[Any], what: str) -> np.ndarray:
 
 
 def _words(path: Path) -> np.ndarray:
+    """Read the words of a text file as booleans or numbers; what follows a # is a remark."""
     with storage.taking_apart(path, "text"):
         lines = storage.read_bytes(path, "text").decode("utf-8-sig").splitlines()
     known: dict[str, bool] = {"true": True, "false": False}
@@ -78,6 +80,7 @@ def _words(path: Path) -> np.ndarray:
 
 
 def _read_marked(path: Path, values: np.ndarray, count: int) -> np.ndarray:
+    """Return marked points (count,) from one value per point, or from the numbers of marked points."""
     if values.ndim != 1:
         raise ValueError(f"{path}: expected one row of values, found an array of shape {values.shape}")
     if values.dtype == bool or (len(values) == count and len(values) > 2 and set(np.unique(values)) <= {0, 1}):
@@ -87,6 +90,7 @@ def _read_marked(path: Path, values: np.ndarray, count: int) -> np.ndarray:
         return values.astype(bool)
     if len(values) and not np.issubdtype(values.dtype, np.integer):
         raise ValueError(f"{path}: expected booleans or numbers of points, found values of type {values.dtype}")
+    # the other form: numbers of points
     bad = np.flatnonzero((values < 0) | (values >= count))
     if len(bad):
         raise ValueError(f"{path}: element {bad[0]}: expected a point of 0..{count - 1}, found {values[bad[0]]}")
@@ -96,22 +100,22 @@ def _read_marked(path: Path, values: np.ndarray, count: int) -> np.ndarray:
 
 
 def _find_painted(path: Path, points: np.ndarray, unit: str | None) -> np.ndarray:
-    """The points nearest to the coloured ones of a file."""
+    """Find the points (n,) of a scan nearest to the coloured ones of a file."""
     cloud = read_points(path, unit)
     if cloud.colors is None:
         raise ValueError(f"{path}: expected colours, those of clothing other than grey; found none")
-    # least difference of two channels of a colour that marks
+    # 0.1: least difference between two channels of a colour that is not grey
     coloured = np.ptp(cloud.colors, axis=1) > 0.1
-    # of the scan's extent: from a point of a marked file to the point it means
+    # 0.06% of the scan's extent, 1 mm on a person: largest distance of a painted point from its scan point
     limit = 6e-4 * float(np.ptp(points, axis=0).max())
     if len(cloud.points) == len(points) and np.allclose(cloud.points, points, rtol=0, atol=limit):
         return coloured
-    far, near = cKDTree(points).query(cloud.points[coloured])
-    off = np.flatnonzero(far > limit)
-    if len(off):
-        which = np.flatnonzero(coloured)[off[0]]
+    far, nearest = cKDTree(points).query(cloud.points[coloured])
+    unmatched = np.flatnonzero(far > limit)
+    if len(unmatched):
+        which = np.flatnonzero(coloured)[unmatched[0]]
         raise ValueError(f"{path}: point {which}: expected the points of the scan, this one is "
-                         f"{1000 * far[off[0]]:.1f} mm from the nearest of them")
+                         f"{1000 * far[unmatched[0]]:.1f} mm from the nearest of them")
     out = np.zeros(len(points), dtype=bool)
-    out[near] = True
+    out[nearest] = True
     return out

@@ -1,4 +1,4 @@
-"""A folder of completions in the browser: worst first, their landmarks mended, completed again from where they were.
+"""Correct a folder of completions in the browser: worst first, move landmarks, complete again from the last result.
 
 Opened by `scape complete SCANS -o FOLDER --interactive`, or from the folder alone.
 """
@@ -29,18 +29,19 @@ from .work import CompletionInputs
 
 
 def mend_completions(folder: Path) -> CompletionsApp:
-    """The app of a folder that `scape complete` made of a folder of scans; ValueError for one that does not tell."""
+    """Return the app for an output folder of `scape complete`; ValueError for a folder without its settings."""
     return CompletionsApp(FolderCall.read(folder), folder)
 
 
 class CompletionsApp(ResultsApp, CompleteApp):
-    """The state of `scape complete SCANS -o FOLDER --interactive`.
+    """State of `scape complete SCANS -o FOLDER --interactive`.
 
     Parameters
     ----------
     call : FolderCall
-        Whose results they are; what is saved is for the same call done.
-    output : the folder of results
+        The call that made the results; what is saved here counts as done for the same call.
+    output : Path
+        Folder of the results.
     """
 
     title, no_result = "Mend completions", "not completed yet"
@@ -49,7 +50,7 @@ class CompletionsApp(ResultsApp, CompleteApp):
         model, self.plain = call.work(True)
         self.call, self.tasks, self.fresh = call, call.tasks(), set[str]()
         self.told = call.description(output, self.plain.model)
-        self._space = Workspace(output, output / HOME)                      # only looked at here
+        self._space = Workspace(output, output / HOME)                      # read only
         self.results = load_results(self._space, list(self.tasks))
         self._name_of = {task.given.scans[0]: name for name, task in self.tasks.items()}
         worst = self.told.worst_first(self.results, self.tasks)
@@ -57,23 +58,23 @@ class CompletionsApp(ResultsApp, CompleteApp):
         self._bring()
 
     def _load_clicked(self, path: Path) -> Clicked:
-        """A scan with the landmarks that the command reads, or will; a file that cannot be read holds none."""
-        found, unit = self.tasks[self._name_of[path]].given.landmarks, self.plain.unit
-        if found is None:
+        """Load a scan with the landmarks that the command reads; an unreadable landmark file counts as empty."""
+        file, unit = self.tasks[self._name_of[path]].given.landmarks, self.plain.unit
+        if file is None:
             return Clicked(path, (self.call.landmarks or path.parent) / (self._name_of[path] + ENDING), unit)
         try:
-            return Clicked.load(path, ENDING, unit, found)
+            return Clicked.load(path, ENDING, unit, file)
         except ValueError:
-            return Clicked(path, found, unit)
+            return Clicked(path, file, unit)
 
     def _inputs(self, scan: Clicked) -> CompletionInputs:
-        """As the command would find them now."""
+        """Return the files of a scan as the command would find them now."""
         return self.tasks[self._name_of[scan.path]].given
 
     # what is stored
 
     def _bring(self) -> None:
-        """The stored completion of the scan that is shown, if it is of this model."""
+        """Load the stored completion of the shown scan, if it belongs to this model."""
         scan = self.scan
         assert scan is not None, "a folder of scans has some"
         if scan.path not in self.made and (folder := self.output / self._name_of[scan.path]).exists():
@@ -87,6 +88,7 @@ class CompletionsApp(ResultsApp, CompleteApp):
             self.known = made.known
 
     def _keep(self, scan: Clicked, done: Completion, folder: Path) -> None:
+        """Hold a stored completion with its inputs as if it had been made here."""
         task = self.tasks[self._name_of[scan.path]]
         places = {name: scan.places[name] for name in self._usable(scan)}
         known = done.betas is None or isinstance(self.plain.body, Subject)
@@ -101,7 +103,7 @@ class CompletionsApp(ResultsApp, CompleteApp):
     # what the page is sent
 
     def scene(self) -> Message:
-        """As of one scan; only the template where the scan cannot be read."""
+        """Return the scene of one scan, or only the template where the scan cannot be read."""
         scan = self.scan
         assert scan is not None, "a folder of scans has some"
         try:
@@ -113,17 +115,17 @@ class CompletionsApp(ResultsApp, CompleteApp):
             return Message("scene", {}, pack_scene([self.template.pane("the model")]))
 
     def judgements(self) -> Iterable[Judgement | None]:
-        """Of the scans."""
+        """Return the judgement of every scan."""
         return (judgement_on(self._name_of[one.path], self.results) for one in self.scans)
 
     def more(self) -> dict[str, Any]:
-        """The folder besides."""
+        """Return the state of the page, with the folder."""
         return {**super().more(), "folder": str(self.output)}
 
     # what the page sends
 
     def on_open(self, send: Send, scan: int) -> None:
-        """Another scan, with what is stored of it."""
+        """Show another scan with its stored result."""
         before = self.current
         if 0 <= scan < len(self.scans) and scan != before:
             self._read.clear()
@@ -133,11 +135,11 @@ class CompletionsApp(ResultsApp, CompleteApp):
         super().on_open(send, scan)
 
     def receive(self, name: str, path: Path, send: Send) -> None:
-        """Files cannot be dropped here."""
+        """Refuse files that are dropped on the page."""
         raise ValueError(f"copy the scan into {self.call.scans}: all scans there are listed here")
 
     def _save(self, scan: Clicked, made: Made) -> None:
-        """Write what the command would have written, so that it counts as done there; and the folder's page anew."""
+        """Write the files of the command, so that the scan counts as done there, and renew the folder's page."""
         if self._is_outdated(made):
             raise ValueError("it has changed since: complete again, then save")
         if scan.path in self.saved:
@@ -145,6 +147,7 @@ class CompletionsApp(ResultsApp, CompleteApp):
         name, self.tasks = self._name_of[scan.path], self.call.tasks()        # the landmark file may be new
         if name not in self.tasks:
             raise ValueError(f"{scan.path}: no such file; it was moved meanwhile")
+        # put the new files in place of the old ones as a whole, then renew table and page
         with workspace(self.output) as space:
             with space.instead(self.plain, self.tasks[name]) as staged:
                 (staged.folder / name).mkdir()
@@ -158,6 +161,6 @@ class CompletionsApp(ResultsApp, CompleteApp):
 
 
 def _is_of(done: Completion, model: BodyModel) -> bool:
-    """Whether a completion is of a model, and not of one with other vertices, parts or betas."""
+    """Tell whether a completion has the vertices, parts and betas of a model."""
     return len(done.completed.vertices) == len(model.template.vertices) \
         and len(done.pose) == len(model.skeleton.parents) and (done.betas is None or len(done.betas) == model.n_betas)

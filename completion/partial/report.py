@@ -1,4 +1,4 @@
-"""Pictures and the page of a completed scan."""
+"""Pictures and report page of a completed scan."""
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
@@ -21,26 +21,26 @@ from scanprep.pictures.sheets import webp_bytes
 
 from .completion import Completion
 
-MEASURED, COMPLETED = (0.55, 0.67, 0.80), (0.93, 0.75, 0.42)
-HEIGHT = 520
+MEASURED, COMPLETED = (0.55, 0.67, 0.80), (0.93, 0.75, 0.42)         # blue and yellow, as the page says
+HEIGHT = 520                         # pixels of the pictures and of the page's bodies
 ERROR, OFF = "expected error", "distance of the scan to the {} body"
 
 
 def picture_completion(scan: View | Sequence[View], completion: Completion, template: Mesh,
                        masked: np.ndarray | None = None) -> np.ndarray:
-    """The scan, and the completed body in two colours from the side that was seen and from behind.
+    """Render the scan and the completed body in two colours, from the side that was seen and from behind.
 
-    `masked` (n,) bool.
+    `masked` (n,) bool marks clothing and hair.
     """
     views = [sides(completion, template)[turn] for turn in (0, 2)]
     body = completion.completed
     colors = np.where(completion.seen[:, None], MEASURED, COMPLETED)
-    given = scan_shapes(scan, masked, completion.scale)
+    scan_parts = scan_shapes(scan, masked, completion.scale)
     shown: list[tuple[Sequence[Shape], Camera, str]] = [
-        (given, views[0], "scan, from the camera"), (given, views[1], "scan, from behind"),
+        (scan_parts, views[0], "scan, from the camera"), (scan_parts, views[1], "scan, from behind"),
         ([Solid(body, colors)], views[0], "completed"), ([Solid(body, colors)], views[1], "completed, from behind"),
         ([Solid(completion.predicted)], views[1], "predicted, from behind")]
-    # one size in which all views fit, at most twice as wide as high: a picture of something long is less high
+    # one size that fits all views, at most twice as wide as high: pictures of long subjects are less high
     aspect = max(view.width / view.height for view in views)
     height = max(1, min(HEIGHT, round(2 * HEIGHT / aspect)))
     width = int(height * aspect) + 10
@@ -49,12 +49,13 @@ def picture_completion(scan: View | Sequence[View], completion: Completion, temp
 
 
 def sides(completion: Completion, template: Mesh) -> list[Camera]:
-    """Cameras around the completed body, from the side that was seen, else its front, and on by quarters."""
+    """Return four cameras around the completed body, a quarter turn apart, the side that was seen first."""
     body = completion.completed
     vertical, ahead = stance(template, rotations.exp(completion.pose[0]))
+    # mean normal of the observed surface, made horizontal
     towards = (body.vertex_areas * completion.seen) @ body.vertex_normals
     towards -= (towards @ vertical) * vertical
-    # a scan from all sides has no mean normal
+    # a scan from all sides has hardly any mean normal: then the front is first
     side = towards / np.linalg.norm(towards) if np.linalg.norm(towards) > 0.05 * body.vertex_areas.sum() else ahead
     aside = np.cross(vertical, side)
     return [Camera.from_side(body, way, vertical) for way in (side, aside, -side, -aside)]
@@ -62,7 +63,7 @@ def sides(completion: Completion, template: Mesh) -> list[Camera]:
 
 def scan_shapes(scan: View | Sequence[View], masked: np.ndarray | None = None, metres: float = 1.0
                 ) -> list[Solid | Dots]:
-    """What a picture shows of a scan: its views, each in its own shade, and what is masked."""
+    """Return the shapes of a scan for a picture: each view in its own shade, masked points in violet."""
     out: list[Solid | Dots] = []
     start = 0
     for number, view in enumerate(scale_view(view, metres) for view in as_views(scan)):
@@ -75,32 +76,33 @@ def scan_shapes(scan: View | Sequence[View], masked: np.ndarray | None = None, m
         if isinstance(view, Mesh) and len(view.faces):
             out.append(Solid(view, colors))
         else:
-            some = slice(None, None, max(1, len(points) // 9000))
-            out.append(Dots(points[some], colors[some], radius=0.005))
+            thinned = slice(None, None, max(1, len(points) // 9000))
+            out.append(Dots(points[thinned], colors[thinned], radius=0.005))
     return out
 
 
 def completion_panes(scan: View | Sequence[View], completion: Completion, template: Mesh,
                      masked: np.ndarray | None = None, landmarks: tuple[np.ndarray, np.ndarray] | None = None,
                      names: Mapping[int, str] | None = None) -> list[Pane]:
-    """The scan beside the completed body, over which the scan and the predicted body can be laid.
+    """Return panes of the scan and of the completed body, which can show the scan and the predicted body as well.
 
-    `masked` and `landmarks` are those of `complete`, in the unit of the scan; `names` of vertices are the landmarks'.
+    `masked` and `landmarks` are those of `complete`, in the unit of the scan; `names` are those of landmark vertices.
     """
-    camera, given = sides(completion, template)[0], scan_shapes(scan, masked, completion.scale)
+    camera, scan_parts = sides(completion, template)[0], scan_shapes(scan, masked, completion.scale)
     marks: list[Shape] = []
     if landmarks is not None:
         labels = [(names or {}).get(int(v), "") for v in landmarks[0]]
         marks = [Dots(completion.scale * np.asarray(landmarks[1]), (0.80, 0.12, 0.10), 0.010, True, name="landmarks",
                       labels=labels)]
-    over = [replace(shape, name="scan over it", visible=False, color=(0.45, 0.42, 0.50)) for shape in given]
-    # what else the bodies are coloured by: how far the scan is, as seen at their vertices, NaN without data
+    over = [replace(shape, name="scan over it", visible=False, color=(0.45, 0.42, 0.50)) for shape in scan_parts]
+    # other colours of the bodies: the scan's own, its distance as seen at the vertices (NaN without data), the error
     body, shades = completion.completed, dict[str, np.ndarray | Heat]()
     if body.colors is not None:
         shades["colours of the scan"] = body.colors
     points = completion.scale * all_points(scan)
     points = points if masked is None else points[~masked]
     off, near = cKDTree(points).query(body.vertices, 3)
+    # 5 and 15 mm end the colour scales: the completed body is nearer to the scan than the model's own
     for mesh, high, which in ((body, 0.005, "completed"), (completion.predicted, 0.015, "predicted")):
         far = Surface(mesh).closest(points).distances[near].mean(axis=1)
         title = OFF.format(which)
@@ -108,16 +110,17 @@ def completion_panes(scan: View | Sequence[View], completion: Completion, templa
     if completion.expected_error is not None:
         high = float(np.ceil(200 * np.nanquantile(completion.expected_error, 0.98)) / 200)
         shades[ERROR] = Heat(completion.expected_error, 0.0, max(high, 0.005), ERROR)
+    # the two bodies with their colours, the predicted one hidden at first
     whole = Solid(Mesh(body.vertices, body.faces), np.where(completion.seen[:, None], MEASURED, COMPLETED),
                   name="completed body", shades=shades)
     predicted = Solid(completion.predicted, (0.62, 0.74, 0.62), name="predicted body", visible=False,
                       shades={title: shades[title] for title in (OFF.format("predicted"), ERROR) if title in shades})
-    return [Pane([*given, *marks], camera, "scan"), Pane([whole, *over, predicted, *marks], camera, "completed")]
+    return [Pane([*scan_parts, *marks], camera, "scan"), Pane([whole, *over, predicted, *marks], camera, "completed")]
 
 
 def completion_page(panes: Sequence[Pane], name: str, metrics: Sequence[Metric], picture: np.ndarray,
                     masked: bool = False) -> Page:
-    """The page of `scape complete`: `completion_panes`, name of the scan, its figures, a picture."""
+    """Write the page of `scape complete` from its panes, the scan's name, the figures and a picture."""
     page = Page(f"{name}, completed", "Blue was measured, yellow was filled in by the body model."
                 + (" Violet is clothing or hair: the body is somewhere inside." if masked else ""))
     page.bodies(panes, "Drag to turn. The list of colours shows how far the scan is from the body, and how far each "

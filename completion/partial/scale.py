@@ -1,4 +1,4 @@
-"""A scan whose unit nobody knows: one factor is found together with pose, place and shape."""
+"""Scans of unknown unit: one scale factor is estimated together with pose, place and shape."""
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
@@ -19,15 +19,15 @@ from scanprep.geometry.least_squares import Dense, levenberg_marquardt, normal_e
 
 from .settings import CompletionConfig
 
-LOOSE = 0.3                          # standard deviation of the logarithm of what the first guess is off by
-POINTS = 1500                        # that show how far a scan extends
+LOOSE = 0.3                          # standard deviation of the logarithm of the scale about the first guess
+POINTS = 1500                        # points from which the extent of a scan or body is taken
 
 
 class ScaledBody(FixedBody):
-    """A body that may be smaller or larger; unknowns are those of the body, then how much it is scaled down.
+    """A body with free scale; unknowns are those of the body and the scale.
 
-    The last unknown stands with the betas, so their prior holds it too: x[-1] = log(factor) / LOOSE, where lengths
-    of the scan times `factor` are metres.
+    The last unknown is among the betas, so the shape prior covers it: x[-1] = log(factor) / LOOSE. Multiply lengths of
+    the scan by `factor` to get metres.
     """
 
     def __init__(self, inner: FixedBody) -> None:
@@ -39,38 +39,41 @@ class ScaledBody(FixedBody):
         self.subject = inner.subject
 
     def fix_shape(self, x: np.ndarray) -> FixedBody:
-        """The body with the shape and size it has at x (P,), as one of known shape."""
+        """Return the body with the shape and size it has at x (P,), as one of known shape."""
         subject = self.inner.fix_shape(x[:-1]).subject
         return self._of(replace(subject, operator=subject.operator.scale_by(float(np.exp(-LOOSE * x[-1])))))
 
     def some(self, ids: np.ndarray) -> FixedBody:
+        """Return the body with some of its vertices (n,) only."""
         return ScaledBody(self.inner.some(ids))
 
     def vertices(self, x: np.ndarray) -> np.ndarray:
-        """The predicted mesh (N, 3) of unknowns (P,)."""
+        """Compute the vertices (N, 3) at the unknowns x (P,), in the unit of the scan."""
         stand = self.subject.origin + x[self.n_angles:self.n_angles + 3]
         return stand + np.exp(-LOOSE * x[-1]) * (self.inner.vertices(x[:-1]) - stand)
 
     def follow(self, vertex_ids: np.ndarray, x: np.ndarray, weights: np.ndarray | None = None) -> Follow:
-        """Surface points as a function of the unknowns (B, P), valid near x (P,)."""
+        """Return surface points as a function of unknowns (B, P), valid near x (P,)."""
         inner, first = self.inner.follow(vertex_ids, x[:-1], weights), self.n_angles
 
         def move(x: np.ndarray) -> MovingPoints:
-            found = inner(x[..., :-1])
+            # y = stand + s (y_body - stand) with s = exp(-LOOSE x[-1]); derivatives by body unknowns, place and scale
+            unscaled = inner(x[..., :-1])
             smaller = np.exp(-LOOSE * x[..., -1])[..., None, None]
             stand = (self.subject.origin + x[..., first:first + 3])[..., None, :]
-            off = smaller * (found.positions - stand)
-            J = np.concatenate([smaller[..., None] * found.jacobian, -LOOSE * off[..., None]], axis=-1)
+            off = smaller * (unscaled.positions - stand)
+            J = np.concatenate([smaller[..., None] * unscaled.jacobian, -LOOSE * off[..., None]], axis=-1)
             J[..., first:first + 3] = np.eye(3)
             return MovingPoints(stand + off, J)
 
         return move
 
     def near(self, vertex_ids: np.ndarray, x: np.ndarray) -> NearPoints:
+        """Return surface points as a function of a single row of unknowns, valid near x (P,)."""
         return _OneByOne(self.follow(vertex_ids, x))
 
     def in_metres(self, x: np.ndarray) -> tuple[np.ndarray, float]:
-        """Unknowns (P-1,) of the body at its own size, and what the scan has to be multiplied with for it."""
+        """Return the unknowns (P - 1,) of the body at its own size, and the factor that brings the scan to metres."""
         factor = float(np.exp(LOOSE * x[-1]))
         out, place = x[:-1].copy(), slice(self.n_angles, self.n_angles + 3)
         out[place] = factor * (self.subject.origin + x[place]) - self.subject.origin
@@ -79,56 +82,57 @@ class ScaledBody(FixedBody):
 
 @dataclass(frozen=True, eq=False)
 class _OneByOne:
-    """Points that follow many unknowns, for one at a time."""
+    """Adapter: a function of many rows of unknowns, called with one row."""
 
     follow: Follow
 
     def positions(self, x: np.ndarray) -> np.ndarray:
-        """(L, 3) metres, of unknowns (P,)."""
+        """Compute positions (L, 3), metres, at unknowns (P,)."""
         return self.follow(x[None]).positions[0]
 
     def columns(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Positions (L, 3) and their derivatives (P, 3, L)."""
-        found = self.follow(x[None])
-        return found.positions[0], np.swapaxes(found.jacobian[0], 0, 2)
+        """Compute positions (L, 3) and their derivatives (P, 3, L)."""
+        points = self.follow(x[None])
+        return points.positions[0], np.swapaxes(points.jacobian[0], 0, 2)
 
 
 def rough_scale(body: FixedBody, points: np.ndarray) -> float:
-    """Metres per unit of a scan, from how far its points (n, 3) extend; good to a tenth or so.
+    """Estimate metres per unit of a scan from the extent of its points (n, 3); accurate to about a tenth.
 
-    Poses the body was learned from are looked at from all sides; those that extend in the scan's proportions, long,
-    wide and deep, say how large it is.
+    Views of known poses from all sides are compared with the scan: those with the same proportions (long, wide, deep)
+    tell the size.
     """
-    some = points[spread_points(points, POINTS)]
-    size, form = _extent(some[None])
+    # the scan's size and proportions
+    size, form = _extent(points[spread_points(points, POINTS)][None])
     poses = _usual_poses(body)
+    # points and normals of the body in all poses
     ids = spread_points(body.template.vertices, POINTS)
     places = body.subject.points(ids).evaluate(poses, np.zeros((len(poses), 3)))
     part = body.skeleton.part_of_vertex(body.template)[ids]
     R = body.skeleton.part_rotations(poses)[:, part]
     normals = (R @ body.template.vertex_normals[ids][:, :, None])[..., 0]
-    directions = 40  # from which each pose is looked at
+    directions = 40  # viewing directions of each pose
     toward = all_rotations(directions)[:, :, 0]
+    # size and proportions of what each direction sees of each pose, and of the whole body
     sizes, forms = [], []
     for y, n in zip(places, normals, strict=True):
         seen = (toward @ n.T > 0.15).astype(float)
         each = _extent(np.repeat(y[None], len(seen) + 1, axis=0), np.vstack([seen, np.ones(len(y))]))
         sizes.append(each[0])
         forms.append(each[1])
-    alike = 25  # views of poses that extend like the scan
+    alike = 25  # the median is taken over that many views with the most similar proportions
     _, near = cKDTree(np.vstack(forms)).query(form[0], min(alike, len(forms) * (directions + 1)))
     return float(np.median(np.concatenate(sizes)[near]) / size[0])
 
 
 def _usual_poses(body: FixedBody) -> np.ndarray:
-    """(M, J, 3) those the body was learned from, where it keeps them, and steps along their main directions."""
-    # main directions of the poses
+    """Return poses (M, J, 3): those the body was learned from, if it keeps them, and steps along 4 main directions."""
     typical = typical_poses(body.pose_mean, body.pose_covariance, 4)
     return np.concatenate([body.pose_examples, typical]) if len(body.pose_examples) else typical
 
 
 def _extent(points: np.ndarray, weights: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
-    """Root mean square distance (B,) from the middle, and its shares (B, 3) along the main axes."""
+    """Compute the root mean square distance (B,) of points (B, n, 3) from their centroid, and its shares (B, 3)."""
     w = np.ones(points.shape[:2]) if weights is None else weights
     w = w / w.sum(axis=1, keepdims=True)
     off = points - (w[:, :, None] * points).sum(axis=1, keepdims=True)
@@ -138,11 +142,12 @@ def _extent(points: np.ndarray, weights: np.ndarray | None = None) -> tuple[np.n
 
 
 def landmark_scale(body: FixedBody, vertices: np.ndarray, points: np.ndarray, config: CompletionConfig) -> float:
-    """What to multiply landmarks (L, 3) with, which are roughly in metres, to be in metres more closely."""
+    """Estimate the factor that brings landmarks (L, 3), roughly in metres, closer to metres."""
     scaled = ScaledBody(body)
     prior = gaussian_prior(body.pose_mean, body.pose_covariance)
     poses = _usual_poses(body)
     here = body.subject.points(vertices).evaluate(poses, np.zeros((len(poses), 3)))
+    # every pose laid on the landmarks by Procrustes with scale
     start, misfit = [], []
     for pose, at in zip(poses, here, strict=True):
         R, _ = rotations.procrustes(at, points)
@@ -153,7 +158,7 @@ def landmark_scale(body: FixedBody, vertices: np.ndarray, points: np.ndarray, co
         turned[0] = rotations.log(R @ rotations.exp(pose[0]))
         stand = points.mean(axis=0) + R @ (body.subject.origin - at.mean(axis=0)) / factor - body.subject.origin
         start.append(np.concatenate([turned.ravel(), stand, np.zeros(body.n_betas), [np.log(factor) / LOOSE]]))
-    # poses that meet the landmarks best and are followed up
+    # the 12 poses that meet the landmarks best are refined, with the pose prior relaxed step by step
     x = np.array(start)[np.argsort(misfit)[:12]]
     follow = scaled.follow(vertices, np.r_[x[0, :-1 - body.n_betas], np.zeros(body.n_betas + 1)])
     weights = np.full(len(points), config.landmark_sd**-2)
@@ -163,5 +168,5 @@ def landmark_scale(body: FixedBody, vertices: np.ndarray, points: np.ndarray, co
                                  energy.pose_prior_term(x, prior, stiff),
                                  energy.shape_prior(x, body.n_angles + 3)])
 
-    found = anneal(lambda x, stiff: levenberg_marquardt(partial(equations, stiff=stiff), x, 8, 1e-3), x)
-    return float(np.exp(LOOSE * found.x[np.argmin(found.energy), -1]))
+    minimum = anneal(lambda x, stiff: levenberg_marquardt(partial(equations, stiff=stiff), x, 8, 1e-3), x)
+    return float(np.exp(LOOSE * minimum.x[np.argmin(minimum.energy), -1]))

@@ -12,23 +12,30 @@ Method = Literal["joint", "alternation"]
 
 @dataclass(frozen=True)
 class CompletionConfig(ScanFitConfig):
-    """Settings of `complete`; those of bringing the body to the scan, and more.
+    """Settings of `complete`, in addition to those of the fit of a body to a scan.
 
     Attributes
     ----------
     method : {"joint", "alternation"}
-        All unknowns at once by Levenberg-Marquardt, or rotations, surface and shape in turns as the paper does; the
-        latter takes SCAPE models only, and neither priors, contact nor free space.
+        "joint" solves for all unknowns at once by Levenberg-Marquardt. "alternation" solves for rotations, surface and
+        shape in turns, as the paper does; it takes SCAPE models only and has no priors, contact or free space.
     surface_weight : float
-        w_Z of Eq. 10: how strongly each measured point draws the completed surface.
+        w_Z of [SCAPE] Eq. 10: how strongly each measured point attracts the completed surface.
     viewpoint : (3,) floats, metres, or one for each view, optional
-        Where the scan was seen from; found by itself when not given.
+        Position of the camera; estimated when not given.
     free_scale : bool
-        The unit of the scan is not known: one factor is found together with pose, place and shape.
+        The unit of the scan is unknown: one scale factor is estimated together with pose, place and shape.
     fill_colors : bool
-        The colours of a scan are spread over what was not seen, which else is grey.
+        Spread the colours of the scan smoothly over what was not seen, which is grey otherwise.
     tolerance : float, metres
         Distance from the truth within which a vertex counts as right in `Completion.confidence`.
+
+    Examples
+    --------
+    >>> CompletionConfig(rounds=5).method
+    'joint'
+
+    [SCAPE] Eq. 10
     """
 
     method: Method = "joint"
@@ -40,11 +47,11 @@ class CompletionConfig(ScanFitConfig):
 
     @classmethod
     def from_paper(cls) -> CompletionConfig:
-        """The paper's way: a few markers become correspondences, then rotations, surface and shape in turns.
+        """Return the settings of the paper: correspondences from a few markers, then blocks solved in turns.
 
-        Not as in the paper: the start is the best of several, from landmarks, typical poses and limbs held otherwise.
-        w_Z and w_T, which it does not print, are ours, and points that lie far from the body count less. Soles are
-        pressed to a scan that ends flat around the feet.
+        Three things differ from the paper. The initialisation is the best of several, from landmarks, typical poses
+        and limbs in other poses. w_Z and w_T, which it does not print, are ours, and distant points count less. Soles
+        are pressed onto a scan that ends flat around the feet.
 
         [SCAPE] §7
         """

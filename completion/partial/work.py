@@ -1,4 +1,4 @@
-"""The scans of `scape complete`: files read, completed, coloured, written with their pages."""
+"""The work of `scape complete` on one scan: read files, complete, colour, write results and page."""
 from __future__ import annotations
 
 import time
@@ -27,12 +27,12 @@ from scanprep.pictures.sheets import save_png
 from scanprep.pictures.textures import Texture, bake_texture, read_texture, write_textured
 from scanprep.registration.ground import soles_row
 
+from .clicked_markers import extra_markers, write_clicked_markers
 from .colors import ColorConfig, blend, carry_colors, views_with_colors
 from .completion import Completion, complete, save_completion
 from .masks import read_mask
 from .report import completion_page, completion_panes, picture_completion
 from .settings import CompletionConfig
-from .worn import extra_markers, write_worn
 
 EXPECTED, EXPLAINED = "expected error of the body, mean", "share of the scan that lies on the body"
 MEASURED = "share of the body that was measured"
@@ -42,10 +42,10 @@ MEANS = (EXPECTED, EXPLAINED, MEASURED, LEFT)
 
 @dataclass(frozen=True, eq=False)
 class CompletionTask:
-    """What the scans of one call have in common."""
+    """Settings and body that all scans of one call share."""
 
     body: BodyModel | Subject
-    model: str = field(metadata={"digest": False})                   # its name, for the report
+    model: str = field(metadata={"digest": False})                   # name of the model, for the report
     marks: dict[str, int]            # name -> vertex of the template
     config: CompletionConfig
     unit: Unit | None = None         # of the scans and landmarks, where the files cannot tell
@@ -53,7 +53,7 @@ class CompletionTask:
     command: str = field(default="", metadata={"digest": False})     # for the report of each scan of a folder
 
     def __call__(self, inputs: CompletionInputs, room: TaskContext) -> list[Metric]:
-        """Complete the scan of some files; the figures."""
+        """Complete one scan and return its figures."""
         start = time.perf_counter()
         metrics = complete_files(self, inputs, room)
         if self.command:
@@ -64,7 +64,7 @@ class CompletionTask:
 
 @dataclass(frozen=True)
 class CompletionInputs:
-    """The files of one scan: its views, landmarks, and masks for all of them or one for each."""
+    """The files of one scan: views, landmarks, and one mask for all views or one for each."""
 
     scans: tuple[Path, ...]
     landmarks: Path | None = None
@@ -73,31 +73,29 @@ class CompletionInputs:
 
 @dataclass(frozen=True, eq=False)
 class ScanFiles:
-    """The views of one scan, and the texture of each that has one."""
+    """The views of one scan, and the texture of each, if any."""
 
     views: tuple[Mesh | PointCloud, ...]
     textures: tuple[Texture | None, ...]
 
     @property
     def colored(self) -> bool:
-        """Whether any view has colours or a texture."""
+        """Tell whether any view has colours or a texture."""
         return any(t is not None or v.colors is not None for v, t in zip(self.views, self.textures, strict=True))
 
     @property
     def mesh(self) -> Mesh | None:
-        """What vertices and faces of a landmark file can refer to: the mesh, where there is one view."""
+        """The only view if it is a mesh: vertex and face numbers in a landmark file refer to it."""
         only = self.views[0] if len(self.views) == 1 else None
         return only if isinstance(only, Mesh) else None
 
 
 def complete_files(work: CompletionTask, inputs: CompletionInputs, room: TaskContext) -> list[Metric]:
-    """Complete the scan of some files into the folder of a room, report.html in it; the figures.
-
-    The first says what the completion is worth.
-    """
-    unit = "m" if work.config.free_scale else work.unit            # then as it stands in the files
+    """Complete one scan into the folder of a task, with its report.html; return the figures, the judgement first."""
+    unit = "m" if work.config.free_scale else work.unit            # "m": numbers as they are in the files
     depth = read_picture(inputs.scans, work.unit)
     files = read_scan_views(inputs.scans, unit) if depth is None else ScanFiles((), ())
+    # landmarks by name, and masks, both in the unit of the scan
     surface = files.mesh or (all_points(files.views) if files.views else None)
     named = read_landmarks(inputs.landmarks, surface, unit) if inputs.landmarks else {}
     landmarks = try_match_landmarks(inputs.landmarks, work.marks, named) if inputs.landmarks else None
@@ -106,18 +104,20 @@ def complete_files(work: CompletionTask, inputs: CompletionInputs, room: TaskCon
         if inputs.masks:
             raise UsageError("--mask: expected none with a depth picture; set the depth of what is not skin to 0")
         files = person_in(depth, work.body.template, landmarks)
+    # complete, which is kept for a later run, and write everything
     scan = list(files.views) if depth is None else depth
     done = room.step("completion", (work.body, work.marks, work.config, work.unit, inputs),
                      lambda: complete(work.body, scan, landmarks, work.config, room.tell, masked))
     return [*write_results(work, inputs, files, done, landmarks, masked, room.folder),
-            *write_worn(room.folder, done, extra_markers(named, work.marks))]
+            *write_clicked_markers(room.folder, done, extra_markers(named, work.marks))]
 
 
 def write_results(work: CompletionTask, inputs: CompletionInputs, files: ScanFiles, done: Completion,
                   landmarks: tuple[np.ndarray, np.ndarray] | None, masked: np.ndarray | None, output: Path
                   ) -> list[Metric]:
-    """Write a completion with its colours, its pictures and its page into a folder; the figures."""
+    """Write a completion with its colours, pictures and page into a folder and return the figures."""
     views, mesh, viewpoint = list(files.views), done.completed, work.config.viewpoint
+    # colours of the vertices, and a texture where a view has one
     if files.colored:
         colors = carry_colors(mesh, done.seen, views, work.colors, viewpoint, done.scale, files.textures)
         if any(texture is not None for texture in files.textures):
@@ -127,6 +127,7 @@ def write_results(work: CompletionTask, inputs: CompletionInputs, files: ScanFil
         done = replace(done, completed=Mesh(mesh.vertices, mesh.faces, colors))
     save_completion(output, done)
     metrics = [judgement_row(done.judgement), *completion_figures(work, inputs, done, landmarks, masked)]
+    # the picture and the page, and a small scene for the page of the folder
     picture = picture_completion(views, done, work.body.template, masked=masked)
     save_png(output / "picture.png", picture)
     name = ", ".join(path.name for path in inputs.scans)
@@ -161,7 +162,7 @@ def completion_figures(work: CompletionTask, inputs: CompletionInputs, done: Com
 
 
 def read_masks(paths: tuple[Path, ...], files: ScanFiles, unit: Unit | None) -> np.ndarray | None:
-    """Which points (n,) are clothing or hair, all views one after the other, from one file or one for each view."""
+    """Read which points (n,) are clothing or hair, one view after the other, from one file or one for each view."""
     if not paths:
         return None
     if len(paths) == 1:
@@ -184,7 +185,7 @@ def read_scan_views(paths: Sequence[Path], unit: str | None = None) -> ScanFiles
 
 
 def read_picture(paths: Sequence[Path], unit: str | None = None) -> DepthPicture | None:
-    """The depth picture among the files, in millimetres where no other unit is told; None without one."""
+    """Read the depth picture among the files, in millimetres unless a unit is given; None without one."""
     pictures = [path for path in paths if path.suffix.lower() == ".png"]
     if not pictures:
         return None
@@ -194,6 +195,6 @@ def read_picture(paths: Sequence[Path], unit: str | None = None) -> DepthPicture
 
 
 def person_in(picture: DepthPicture, template: Mesh, landmarks: tuple[np.ndarray, np.ndarray] | None) -> ScanFiles:
-    """The person in a depth picture, as a view; `landmarks` are those of `complete`."""
+    """Return the person in a depth picture as a view; `landmarks` are those of `complete`."""
     person = prepare_picture(picture, size(template), np.zeros((0, 3)) if landmarks is None else landmarks[1])
     return ScanFiles((PointCloud(person.points, person.normals),), (None,))

@@ -63,11 +63,13 @@ def track_frames(frames: FramesArg, output: Output, model: ModelOrNone = None, r
     body = body_of(loaded, subject, unit)
     marked = None if landmarks is None else read_landmark_pairs(loaded, name, landmarks, template_landmarks, unit)
     whose = Path(subject) if subject not in (None, "template") else subject
+    # what kept frames depend on; smoothing comes after them
     key = space.digests.of(model or loaded, whose, marked, unit, replace(config, smoothing=0), rate, surfaces)
     with bar("following the body") as progress:
         done = follow_folder(BodyTracker(body, config, rate, marked), found, space, key, surfaces, progress)
     if done.fresh < len(found):
         say(f"{len(found) - done.fresh} of {len(found)} frames were tracked before")
+    # the whole motion, smoothed, and its figures
     motion = as_motion(done.frames, done.state.betas, rate, config)
     person = body if isinstance(body, Subject) else loaded.subject(motion.betas)
     residual = motion.residuals[motion.converged, 0] if motion.converged.any() else np.array([np.nan])
@@ -81,6 +83,7 @@ def track_frames(frames: FramesArg, output: Output, model: ModelOrNone = None, r
         track_page(motion, person, lambda t: _points(found[t]), frames.name, found.numbers, metrics).write(
             folder / "report.html")
 
+    # write files and page in steps that are kept, then judge
     of_motion = done.key, config.smoothing
     metrics += space.step("animation", of_motion, lambda folder: write_glb(folder / "animation.glb", motion, person))
     space.step("motion", (of_motion, metrics, frames.name), write)
@@ -93,12 +96,12 @@ def track_frames(frames: FramesArg, output: Output, model: ModelOrNone = None, r
 
 
 def _points(views: Sequence[PointCloud]) -> np.ndarray:
-    """What all cameras saw in a frame, (n, 3) metres."""
+    """Return the points (n, 3) of all cameras in a frame, metres."""
     return np.concatenate([np.zeros((0, 3)), *(view.points for view in views)])
 
 
 def wrong_size(frames: FrameFolder, person: Subject) -> str | None:
-    """Why frames cannot show the body, by the largest of a few of them; None where they can."""
-    some = spread_indices(len(frames), 5)
-    spans = [extent(_points(frames[t])) for t in some]
+    """Return why frames cannot show the body, by the largest of five of them, or None where they can."""
+    sampled = spread_indices(len(frames), 5)
+    spans = [extent(_points(frames[t])) for t in sampled]
     return unit_problem(float(np.fmax.reduce(spans)), extent(person.template.vertices), "the frames are", 0.1)

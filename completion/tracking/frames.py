@@ -1,4 +1,4 @@
-"""A frame of one or several depth cameras made ready for matching, fast and without trust in noisy normals."""
+"""Prepare a frame of one or several depth cameras for matching: fast, and robust to noisy normals."""
 from __future__ import annotations
 
 from collections.abc import Sequence
@@ -14,14 +14,14 @@ from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.places import distinct_places
 from scanprep.geometry.sanitise import sanitise
 
-CLOSE, AGREE = 0.05, 0.95            # metres; share of those this close that face as the body does: 0.99 of a walk
+CLOSE, AGREE = 0.05, 0.95            # metres; least share of triangles this close that face like the body; a walk: 0.99
 
 Frame = Mesh | PointCloud | np.ndarray | Sequence[View] | None
 
 
 @dataclass(frozen=True, eq=False)
 class _Points:
-    """The points of one view: (n, 3), what is said of their normals (n, 3) or None, and where they were seen from."""
+    """The points (n, 3) of one view, their given normals (n, 3) or None, and the camera (3,) or None, metres."""
 
     points: np.ndarray
     rough: np.ndarray | None
@@ -29,7 +29,7 @@ class _Points:
 
 
 class _Skin(NamedTuple):
-    """Where the body is expected: its vertices, to find the nearest of them, and their normals (N, 3)."""
+    """The expected body: a search tree of its vertices, and their normals (N, 3)."""
 
     tree: cKDTree
     normals: np.ndarray
@@ -37,33 +37,36 @@ class _Skin(NamedTuple):
 
 def prepare_frame(frame: Frame, count: int, neighbours: int, viewpoints: Any = None, expected: Mesh | None = None
                   ) -> ScanPoints | None:
-    """Points with normals of a frame, or None when it shows nothing.
+    """Return points with normals of a frame, or None when it shows nothing.
 
-    Normals are those of planes through many neighbours, so that some millimetres of noise do not turn them. Their sign
-    is that of given normals or triangles, else towards the viewpoint, one or one for each camera, else that of the
-    expected body, else outward by the form of the cloud.
+    Normals are those of planes through many neighbours, so that noise of some millimetres does not turn them. Their
+    sign is taken, in this order, from given normals or triangles, from the viewpoint of the camera, from the expected
+    body, or from the shape of the point cloud.
     """
+    # read the views, each with its camera; views with too few points for a normal are left out
     views = [] if frame is None else [frame] if isinstance(frame, Mesh | PointCloud | np.ndarray) else list(frame)
-    given = None if viewpoints is None else np.broadcast_to(np.asarray(viewpoints, float), (len(views), 3))
+    cameras = None if viewpoints is None else np.broadcast_to(np.asarray(viewpoints, float), (len(views), 3))
     skin = None if expected is None else _Skin(cKDTree(expected.vertices), expected.vertex_normals)
-    read = [_read(view, None if given is None else given[i], i, skin) for i, view in enumerate(views)]
+    read = [_read(view, None if cameras is None else cameras[i], i, skin) for i, view in enumerate(views)]
     read = [view for view in read if len(view.points) > max(NEIGHBOURS, neighbours)]
-    if sum(len(view.points) for view in read) < 60:  # points below which a frame shows nothing
+    if sum(len(view.points) for view in read) < 60:  # fewer points show nothing
         return None
     parts = [_orient(view, count // len(read), neighbours, skin) for view in read]
     points, normals = (np.concatenate([part[i] for part in parts]) for i in (0, 1))
     dense = np.concatenate([part[2] for part in parts])
+    # borders are those of all views together
     border, spacing = _borders(points, normals, dense, neighbours)
     number = np.repeat(np.arange(len(parts)), [len(part[0]) for part in parts])
     return ScanPoints(points, normals, border, spacing, number, np.arange(len(points)))
 
 
 def frame_views(cloud: ScanPoints) -> list[PointCloud]:
-    """A prepared frame as the views that `complete` takes."""
+    """Return a prepared frame as the views that `complete` takes."""
     return [PointCloud(cloud.points[cloud.view == k], cloud.normals[cloud.view == k]) for k in np.unique(cloud.view)]
 
 
 def _read(view: View, viewpoint: np.ndarray | None, number: int, skin: _Skin | None) -> _Points:
+    """Return the points of a view, finite and each place once, with the normals that its triangles or file give."""
     if isinstance(view, Mesh):
         sound = view if skin is not None and _faces_as(skin, view) else sanitise(view, f"frame: view {number}")
         points, rough = view.vertices, sound.vertex_normals if len(sound.faces) else None
@@ -83,20 +86,19 @@ def _read(view: View, viewpoint: np.ndarray | None, number: int, skin: _Skin | N
 
 
 def _faces_as(skin: _Skin, view: Mesh) -> bool:
-    """Whether the triangles of a view face outward: nearly all that lie near the expected body face as it does.
+    """Tell whether the triangles of a view face outward: nearly all near the expected body face as it does.
 
-    Without a body rays would have to tell it, as `sanitise` asks them: that takes more than ten times as long.
+    Without a body `sanitise` casts rays, which takes more than ten times as long.
     """
-    # some of the triangles, without those at vertices that are not finite
-    # triangles of a view that are compared with the expected body
-    some = view.faces[:: max(1, len(view.faces) // 500)]
-    corners = view.vertices[some]
+    # some 500 of the triangles, without those at vertices that are not finite
+    corners = view.vertices[view.faces[:: max(1, len(view.faces) // 500)]]
     middle = corners.mean(axis=1)
     seen = np.isfinite(middle).all(axis=1)
     if not seen.any():
         return False
+    # normals of these triangles
     normals = np.cross(corners[seen, 1] - corners[seen, 0], corners[seen, 2] - corners[seen, 0])
-    # against the nearest vertex of the body
+    # compared with the normal at the nearest vertex of the body
     far, nearest = skin.tree.query(middle[seen], distance_upper_bound=CLOSE)
     near = np.isfinite(far)
     agree = np.einsum("fd,fd->f", normals[near], skin.normals[nearest[near]]) > 0
@@ -105,39 +107,42 @@ def _faces_as(skin: _Skin, view: Mesh) -> bool:
 
 def _orient(view: _Points, count: int, neighbours: int, skin: _Skin | None
             ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Some points of a view, their normals, and the denser points that these were made from."""
-    denser = 4  # times as many points as are matched make the normals
+    """Return some points of a view, their normals, and the denser points that gave the normals."""
+    denser = 4  # normals come from four times as many points as are matched
     many = spread_points(view.points,
                          denser * count) if len(view.points) > denser * count else np.arange(len(view.points))
     dense = view.points[many]
-    few = spread_points(dense, count) if len(dense) > count else np.arange(len(dense))
-    _, near = cKDTree(dense).query(dense[few], neighbours)
+    chosen = spread_points(dense, count) if len(dense) > count else np.arange(len(dense))
+    # the normal is the direction of least spread of the neighbours
+    _, near = cKDTree(dense).query(dense[chosen], neighbours)
     around = dense[near] - _middles(dense, near)[:, None]
     normals = np.linalg.eigh(np.swapaxes(around, 1, 2) @ around)[1][:, :, 0]
+    # a direction outward, for the sign
     if view.rough is not None:
         outward = view.rough[many][near].sum(axis=1)
     elif view.viewpoint is not None:
-        outward = view.viewpoint - dense[few]
+        outward = view.viewpoint - dense[chosen]
     elif skin is not None:
-        outward = skin.normals[skin.tree.query(dense[few], 4)[1]].sum(axis=1)
+        outward = skin.normals[skin.tree.query(dense[chosen], 4)[1]].sum(axis=1)
     else:
-        outward = prepare_scan(dense).normals[few]
+        outward = prepare_scan(dense).normals[chosen]
     normals *= np.where(np.einsum("nd,nd->n", normals, outward) < 0, -1, 1)[:, None]
-    return dense[few], normals, dense
+    return dense[chosen], normals, dense
 
 
 def _borders(points: np.ndarray, normals: np.ndarray, dense: np.ndarray, neighbours: int
              ) -> tuple[np.ndarray, float]:
-    """Which points lie on the border of what all views show, where neighbours are on one side; and the spacing."""
+    """Find border points (n,), whose neighbours are all on one side, and the median spacing, metres."""
     distance, near = cKDTree(dense).query(points, neighbours)
     mean = _middles(dense, near) - points
     mean -= np.einsum("nd,nd->n", mean, normals)[:, None] * normals
-    # offset of the neighbours' mean, as a share of their reach, at a border
+    # 0.35: at a border the mean of the neighbours is that far off, as a share of their reach
     border = np.linalg.norm(mean, axis=1) > 0.35 * distance[:, -1]
+    # spacing: mean distance of the 4 nearest points, the median over all
     apart = cKDTree(points).query(points, 5)[0][:, 1:].mean(axis=1)
     return border, float(np.median(apart))
 
 
 def _middles(points: np.ndarray, near: np.ndarray) -> np.ndarray:
-    """(m, 3) the mean of some points (n, 3) each, by number (m, k); a coordinate at a time is four times as fast."""
+    """Compute means (m, 3) of points (n, 3) by number (m, k); one coordinate at a time is four times as fast."""
     return np.stack([along[near].mean(axis=1) for along in points.T], axis=1)

@@ -16,17 +16,17 @@ from ..motion_pictures import chart_residuals, frames_to_play, moving_pane
 
 def track_page(motion: Motion, subject: Subject, cloud: Callable[[int], np.ndarray], name: str, numbers: list[int],
                metrics: Sequence[Metric]) -> Page:
-    """The page of `scape track`; `cloud` frame -> (n, 3), metres; numbers are those of the frames in their files."""
+    """Make the page of `scape track`; `cloud` gives the points (n, 3) of a frame, `numbers` are of the files."""
     page = Page(f"{name}, tracked", "The body, and some of the points that were measured in each frame. Where it is "
                 "grey the frame was lost.")
-    # some of the points of each frame, at most 300,000 of all together
+    # at most 300,000 points in all, so that the page stays small; 100 to 1000 of each frame
     frames, _ = frames_to_play(motion)
     count = int(np.clip(300_000 // len(frames), 100, 1000))
     points = np.full((len(frames), count, 3), np.nan)
     for row, t in enumerate(frames):
         measured = cloud(int(t))
-        some = measured[np.linspace(0, len(measured) - 1, min(count, len(measured))).astype(int)]
-        points[row, :len(some)] = some
+        chosen = measured[np.linspace(0, len(measured) - 1, min(count, len(measured))).astype(int)]
+        points[row, :len(chosen)] = chosen
     dots = Dots(points[0], (0.16, 0.42, 0.72), radius=0.006, name="measured points")
     page.bodies([moving_pane(motion, subject, [(dots, points)], color=(0.90, 0.78, 0.55))],
                 "Press the triangle to play, drag the body to turn it.", 520)
@@ -39,6 +39,6 @@ def track_page(motion: Motion, subject: Subject, cloud: Callable[[int], np.ndarr
 
 
 def _ranges(numbers: np.ndarray) -> str:
-    """Numbers with runs as "first to last"."""
+    """Write numbers as text, with runs as "first to last"."""
     runs = np.split(numbers, np.flatnonzero(np.diff(numbers) > 1) + 1)
     return ", ".join(f"{run[0]}" if len(run) == 1 else f"{run[0]} to {run[-1]}" for run in runs)

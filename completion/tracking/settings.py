@@ -23,21 +23,28 @@ class TrackConfig(Settings):
     rounds : int
         Matchings of a frame, at most.
     angle_acceleration : float, radians per second squared
-        How strongly joints accelerate, as a standard deviation.
+        Standard deviation of the acceleration of joint angles.
     place_acceleration : float, metres per second squared
-        The same for the place.
+        Standard deviation of the acceleration of the place.
     lost : float, metres
-        A frame whose points lie farther from the body than this, on average, is lost.
+        A frame is lost when its points lie farther from the body than this, on average.
     search_every : int
-        Of so many frames that are lost one is searched from scratch; the others from the last good pose.
+        One of so many lost frames is searched from scratch; the others start from the last good pose.
     shape_frames : int
         First frames that are kept until the shape of an unknown person is found from some of them.
     shape_views : int
-        How many of these are used together.
+        How many of these frames are used together, those that differ most.
     smoothing : int
-        Rounds over the whole sequence at the end; 0 leaves the frame-by-frame solution.
+        Rounds of temporal smoothing over the whole sequence at the end; 0 leaves the frame-by-frame solution.
     start : CompletionConfig
-        How the first frame is completed, and one that is searched from scratch.
+        How the first frame, and one that is searched from scratch, is completed.
+
+    Examples
+    --------
+    >>> TrackConfig(frame_points=500).scan.scan_points
+    500
+
+    [SCAPE-patent] claims 11-15
     """
 
     frame_points: Count = 2000
@@ -55,5 +62,5 @@ class TrackConfig(Settings):
 
     @property
     def scan(self) -> CompletionConfig:
-        """How the points of a frame count. It is thinned too much to be sure where a camera saw nothing."""
+        """Settings of the fit to one frame; its points are too sparse to tell where a camera saw free space."""
         return replace(self.start, scan_points=self.frame_points, model_points=self.body_points, free_space_weight=0.0)

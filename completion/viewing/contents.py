@@ -23,34 +23,39 @@ from scanprep.viewer.clicked import camera_before
 
 from ..partial.completion import Completion
 
-SHOWN_OFF = 0.03                     # metres: residual of a marker that is darkest
-MARKER = (0.85, 0.25, 0.2)
+SHOWN_OFF = 0.03                     # metres: residual of a marker that is shown darkest
+MARKER = (0.85, 0.25, 0.2)           # colour of markers and landmarks
+# name of an axis -> its direction
 AXES = {f"{sign}{axis}": s * np.eye(3)[i] for sign, s in (("", 1.0), ("-", -1.0)) for i, axis in enumerate("xyz")}
 
 
 @dataclass(frozen=True, eq=False)
 class Stance:
-    """Where a thing is, and how it stands: extent (n, 3) metres, the axis that is up and where the front is."""
+    """Where a thing is and how it stands.
+
+    `extent` (n, 3), metres, are points that must be visible; `up` and `front` are unit vectors (3,).
+    """
 
     extent: np.ndarray
     up: np.ndarray
     front: np.ndarray
-    seen: Camera | None = None           # the first view, where one is given
+    seen: Camera | None = None           # a fixed first view, where there is one
 
     @staticmethod
     def of(mesh: Mesh, poses: np.ndarray | None = None) -> Stance:
-        """As far as it can be told from the outline of a body; `poses` (T, J, 3) are what it does."""
+        """Guess the stance from the outline of a body; `poses` (T, J, 3) are its motion."""
         return Stance(_box(mesh.vertices), *stance(mesh, None if poses is None else rotations.exp(poses[:, 0])))
 
     def around(self, points: np.ndarray) -> Stance:
-        """The same way up, at other places (..., 3)."""
+        """Return the same stance around other points (..., 3)."""
         return replace(self, extent=_box(points.reshape(-1, 3)))
 
     def camera(self, up: np.ndarray | None = None) -> Camera:
-        """A view from beside the front, 20 degrees to its side and 8 above, this way up."""
+        """Return a camera 20 degrees beside the front and 8 degrees above."""
         if self.seen is not None:
             return self.seen
         up = self.up if up is None else up
+        # a front along the vertical would give no side: take any other direction
         front = self.front if np.linalg.norm(np.cross(self.front, up)) > 0.1 else np.roll(up, 1)
         flat = front - (front @ up) * up
         side = np.cos(np.radians(20)) * flat + np.sin(np.radians(20)) * np.cross(up, flat)
@@ -58,24 +63,24 @@ class Stance:
 
 
 @dataclass(frozen=True, eq=False)
-class MarkersTold:
-    """Residuals (T, L) metres of markers that are dots of one of the shapes, NaN where they were not seen."""
+class MarkerResiduals:
+    """Residuals (T, L), metres, of markers that are dots of one of the shapes; NaN where not seen."""
 
     shape: int
     labels: tuple[str, ...]
     residuals: np.ndarray
 
     def colors(self) -> dict[str, Any]:
-        """The distance shown darkest, and the colours up to it with that of no value last."""
+        """Return the residual shown darkest, and the palette, with the colour for no value last."""
         ramp = Heat(np.append(np.linspace(0, 1, NO_INDEX), np.nan), 0, 1).colors()
         return {"high": SHOWN_OFF, "palette": np.round(255 * ramp).astype(np.uint8).tobytes().hex()}
 
 
 @dataclass(frozen=True, eq=False)
 class Content:
-    """One thing, as it is shown: its first shape is a model's body, or a statue's surface, where there is one.
+    """One thing as it is shown; its first shape is the body of a model, or the surface of a statue, if it has one.
 
-    `start` is the stance in the first frame of a motion, for a view that goes along with it.
+    `start` is the stance in the first frame of a motion, for a view that follows it.
     """
 
     name: str
@@ -85,51 +90,52 @@ class Content:
     start: Stance | None = None
     model: BodyModel | None = None
     statue: Statue | None = None
-    markers: MarkersTold | None = None
+    markers: MarkerResiduals | None = None
     notes: tuple[str, ...] = ()
 
 
 def of_mesh(name: str, shape: Mesh | np.ndarray, landmarks: dict[str, np.ndarray] | None = None) -> Content:
-    """A mesh, or points (n, 3), with landmarks; not more of it than a browser turns smoothly."""
+    """Show a mesh, or points (n, 3), with landmarks; simplified so that a browser turns it smoothly."""
     mesh = shape if isinstance(shape, Mesh) else Mesh(shape, np.zeros((0, 3), dtype=np.int64))
-    stands = Stance.of(mesh)
-    marks = [mark_places(landmarks, stands, "landmarks")] if landmarks else []
+    stance = Stance.of(mesh)
+    marks = [mark_places(landmarks, stance, "landmarks")] if landmarks else []
     if not len(mesh.faces):
-        size, every = float(np.linalg.norm(np.ptp(stands.extent, axis=0))), max(1, len(mesh.vertices) // 150_000)
-        return Content(name, [Dots(mesh.vertices[::every], CLAY, size / 500), *marks], stands,
+        size, every = float(np.linalg.norm(np.ptp(stance.extent, axis=0))), max(1, len(mesh.vertices) // 150_000)
+        return Content(name, [Dots(mesh.vertices[::every], CLAY, size / 500), *marks], stance,
                        f"{len(mesh.vertices):,} points")
-    shown = thin_solid(Solid(mesh, shades={"plain": np.array(CLAY)} if mesh.colors is not None else {}), 120_000)
-    few = len(shown.mesh.faces) < len(mesh.faces)
-    notes = (f"{name}: shown with fewer than its {len(mesh.faces):,} triangles",) * few
-    return Content(name, [shown, *marks], stands, sizes(mesh), notes=notes)
+    solid = thin_solid(Solid(mesh, shades={"plain": np.array(CLAY)} if mesh.colors is not None else {}), 120_000)
+    simplified = len(solid.mesh.faces) < len(mesh.faces)
+    notes = (f"{name}: shown with fewer than its {len(mesh.faces):,} triangles",) * simplified
+    return Content(name, [solid, *marks], stance, sizes(mesh), notes=notes)
 
 
-def mark_places(places: Mapping[str, np.ndarray], stands: Stance, name: str) -> Dots:
-    """Landmarks or markers on a thing, with their names."""
-    size = float(np.linalg.norm(np.ptp(stands.extent, axis=0)))
+def mark_places(places: Mapping[str, np.ndarray], stance: Stance, name: str) -> Dots:
+    """Show landmarks or markers on a thing, with their names."""
+    size = float(np.linalg.norm(np.ptp(stance.extent, axis=0)))
     return Dots(np.array(list(places.values())), MARKER, size / 160, True, name=name, labels=tuple(places))
 
 
 def from_camera(content: Content) -> Content:
-    """A mesh that a depth camera saw, from where that was."""
+    """Show a mesh seen by a depth camera from where the camera was."""
     body = content.shapes[0]
     assert isinstance(body, Solid)
     return replace(content, stance=replace(content.stance, seen=camera_before(body.mesh.vertices)))
 
 
 def sizes(mesh: Mesh) -> str:
-    """How many vertices and triangles."""
+    """Return the number of vertices and triangles as text."""
     return f"{len(mesh.vertices):,} vertices, {len(mesh.faces):,} triangles"
 
 
 def body_shades(mesh: Mesh, part_of_face: np.ndarray, **more: Any) -> Solid:
-    """A body in one colour, or by its parts."""
+    """Show a body in one colour, or coloured by parts."""
     return Solid(mesh, CLAY, shades={"parts": part_colors(part_of_face)}, **more)
 
 
 def of_model(name: str, model: BodyModel) -> Content:
-    """A model's mean body, or its template's own, at rest."""
+    """Show the mean body of a model, or its template, at rest."""
     body = at_rest(model)
+    # 12% more room than the body at rest, as its limbs will move
     reach = (body.vertices - body.vertices.mean(axis=0)) * 1.12 + body.vertices.mean(axis=0)
     return Content(name, [body_shades(body, model.skeleton.part_of_face)],
                    replace(Stance.of(body), extent=_box(reach)),
@@ -137,36 +143,37 @@ def of_model(name: str, model: BodyModel) -> Content:
 
 
 def of_subject(name: str, subject: Subject) -> Content:
-    """A body of fixed shape at rest."""
+    """Show a body of fixed shape at rest."""
     body = subject.template.with_vertices(subject.vertices(np.zeros((len(subject.skeleton.parents), 3))))
     return Content(name, [body_shades(body, subject.skeleton.part_of_face)], Stance.of(body), sizes(body))
 
 
-def of_completion(name: str, done: Completion) -> Content:
-    """The completed body, with what was seen and how far it may be off, and the predicted one to be shown too."""
-    mesh = done.completed
-    shades: dict[str, np.ndarray | Heat] = {"seen": np.where(done.seen[:, None], CLAY, (0.55, 0.66, 0.80))}
-    if done.expected_error is not None:
-        error = np.asarray(done.expected_error, dtype=float)
+def of_completion(name: str, completion: Completion) -> Content:
+    """Show a completed body: what was seen, its expected error, and hidden at first the predicted body."""
+    mesh = completion.completed
+    shades: dict[str, np.ndarray | Heat] = {"seen": np.where(completion.seen[:, None], CLAY, (0.55, 0.66, 0.80))}
+    if completion.expected_error is not None:
+        error = np.asarray(completion.expected_error, dtype=float)
         shades["expected error"] = Heat(error, 0.0, max(float(np.nanpercentile(error, 98)), 1e-3), "expected error")
     if mesh.colors is not None:
         shades["plain"] = np.array(CLAY)
     shapes = [Solid(mesh, name="completed", shades=shades),
-              Solid(done.predicted, (0.55, 0.66, 0.80), name="predicted", visible=False)]
-    return Content(name, shapes, Stance.of(mesh), str(done.judgement))
+              Solid(completion.predicted, (0.55, 0.66, 0.80), name="predicted", visible=False)]
+    return Content(name, shapes, Stance.of(mesh), str(completion.judgement))
 
 
 def collect_warnings(make: Callable[[], Content]) -> Content:
-    """What is made, with the warnings on the way as its notes; they are given again."""
+    """Make a content; warnings on the way become its notes, and are repeated."""
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", UserWarning)
         content = make()
-    mine = [str(w.message) for w in caught if issubclass(w.category, UserWarning)]
-    for text in mine:
+    texts = [str(w.message) for w in caught if issubclass(w.category, UserWarning)]
+    for text in texts:
         warnings.warn(text, stacklevel=2)
-    return replace(content, notes=(*mine, *content.notes))
+    return replace(content, notes=(*texts, *content.notes))
 
 
 def _box(points: np.ndarray) -> np.ndarray:
+    """Return two corners (2, 3) of the box around finite points."""
     points = points[np.isfinite(points).all(axis=1)]
     return np.stack([points.min(axis=0), points.max(axis=0)])

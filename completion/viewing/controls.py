@@ -1,4 +1,4 @@
-"""The sliders of models that are shown: shape, pose and place, which all models share as far as they have them."""
+"""Sliders of shape, pose and place, shared by all models that are shown."""
 from __future__ import annotations
 
 from dataclasses import dataclass, field
@@ -14,7 +14,7 @@ from .movable import MovableBody
 
 @dataclass(frozen=True, eq=False)
 class Shown:
-    """The body of a model, and which layer of which pane it is."""
+    """The body of a model, and the pane and layer that show it."""
 
     body: MovableBody
     name: str
@@ -24,9 +24,10 @@ class Shown:
 
 @dataclass(eq=False)
 class Controls:
-    """Where the sliders stand.
+    """The state of the sliders.
 
-    Betas of the same number and parts of the same name go together; a model without betas is its template's own body.
+    All models with at least k betas share the k-th beta; parts of the same name share their angles. A model without
+    betas shows its template's own body.
     """
 
     shown: list[Shown] = field(default_factory=list)
@@ -38,7 +39,7 @@ class Controls:
     rng: np.random.Generator = field(default_factory=np.random.default_rng)
 
     def take(self, shown: list[Shown]) -> None:
-        """Other bodies; what the sliders say stays as far as they have it."""
+        """Take other bodies; the sliders keep their values where the new bodies have them."""
         count = max([one.body.model.n_betas for one in shown], default=0)
         betas = np.zeros(count)
         betas[:min(count, len(self.betas))] = self.betas[:count]
@@ -49,21 +50,21 @@ class Controls:
             self.chosen = next(iter(names), "")
 
     def pose_of(self, body: MovableBody) -> np.ndarray:
-        """(J, 3)"""
+        """Return the pose (J, 3) of a body, radians."""
         return np.array([self.turns[name] for name in body.parts])
 
     def betas_of(self, body: MovableBody) -> np.ndarray | None:
-        """(K,), or None for a model without."""
+        """Return the betas (K,) of a body, or None for a model without betas."""
         return self.betas[:body.model.n_betas] if body.model.n_betas else None
 
     def vertices(self, body: MovableBody) -> np.ndarray:
-        """(N, 3) float32, metres, relative to the body's `origin`."""
+        """Compute the vertices (N, 3) float32, metres, relative to the body's `origin`."""
         return body.vertices(self.betas_of(body), self.pose_of(body), self.trans)
 
     # what sliders and buttons do
 
     def set_beta(self, index: int, value: float) -> None:
-        """One component of the shape, standard deviations."""
+        """Set one shape coefficient, standard deviations."""
         if not 0 <= index < len(self.betas):
             raise ValueError(f"index: expected 0 to {len(self.betas) - 1}, got {index}")
         BETAS.check(np.array(value), "betas")
@@ -72,7 +73,7 @@ class Controls:
         self.betas = betas
 
     def set_turn(self, part: str, turn: list[float]) -> None:
-        """A part against its parent, axis times angle in radians."""
+        """Turn a part relative to its parent, axis-angle in radians."""
         value = np.asarray(turn, dtype=float)
         if part not in self.turns or value.shape != (3,):
             raise ValueError(f"part: expected one of {', '.join(self.turns)} and three angles, got {part} {turn}")
@@ -80,11 +81,11 @@ class Controls:
         self.turns[part] = value
 
     def random_body(self) -> None:
-        """Betas drawn as the training people's are spread."""
+        """Draw random betas, distributed like those of the training people."""
         self.betas = self.rng.normal(size=len(self.betas))
 
     def random_pose(self) -> None:
-        """A pose from the prior of the first model, within what its joints were seen to do."""
+        """Draw a pose from the pose prior of the first model, within the seen limits of its joints."""
         if not self.shown:
             return
         body = self.shown[0].body
@@ -96,7 +97,7 @@ class Controls:
         self.trans = np.zeros(3)
 
     def reset(self) -> None:
-        """The mean body at rest."""
+        """Return to the mean body at rest."""
         self.betas = np.zeros_like(self.betas)
         self.turns = {name: np.zeros(3) for name in self.turns}
         self.trans = np.zeros(3)
@@ -104,12 +105,12 @@ class Controls:
     # dragging
 
     def choose_part(self, part: str) -> None:
-        """The part whose angles are shown."""
+        """Choose the part whose angles are shown."""
         if part in self.turns:
             self.chosen = part
 
     def choose(self, pane: int, layer: int, vertex: int) -> Shown:
-        """The part that was clicked."""
+        """Choose the part that was clicked."""
         one = next((one for one in self.shown if (one.pane, one.layer) == (pane, layer)), None)
         if one is None:
             raise ValueError(f"pane and layer: expected a model's body, got {pane}, {layer}")
@@ -119,12 +120,12 @@ class Controls:
         return one
 
     def grab(self, pane: int, layer: int, vertex: int) -> None:
-        """Take hold of a vertex."""
+        """Grab a vertex."""
         one = self.choose(pane, layer, vertex)
         self.held = one, Drag(one.body, vertex, self.betas_of(one.body), self.pose_of(one.body))
 
     def drag(self, target: list[float]) -> None:
-        """Move it towards a place (3,), metres."""
+        """Drag the grabbed vertex towards a place (3,), metres."""
         wanted = np.asarray(target, dtype=float)
         if wanted.shape != (3,) or not np.isfinite(wanted).all():
             raise ValueError(f"target: expected three finite numbers, got {target}")

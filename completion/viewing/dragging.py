@@ -1,4 +1,4 @@
-"""A pose by dragging: joints between the trunk and a point of the body turn until the point is where it is wanted."""
+"""Pose a body by dragging: joints between trunk and a point turn until the point is where the mouse wants it."""
 from __future__ import annotations
 
 import numpy as np
@@ -9,24 +9,28 @@ from model.priors import whitening
 
 from .movable import MovableBody
 
-HOLD, USUAL = 0.05, 0.02             # weights of the pose it had, and of poses the model was learned from
+HOLD, USUAL = 0.05, 0.02             # weights of two priors: the pose when grabbed, and the model's own poses
 
 
 class Drag:
-    """A vertex in the user's hand.
+    """A vertex that the user drags.
 
     Parameters
     ----------
     body : MovableBody
+        The body.
     vertex : int
+        Vertex that was grabbed.
     betas : (K,) float or None
+        Shape of the body.
     pose : (J, 3) float, radians
-        When the hand took hold.
+        Pose at the start of the drag.
     """
 
     def __init__(self, body: MovableBody, vertex: int, betas: np.ndarray | None, pose: np.ndarray) -> None:
         self.operator: PointOperator = body.point(vertex, betas)
         self.part = int(body.part_of_vertex[vertex])
+        # only the joints between the part and the root turn
         chain, part = list[int](), self.part
         while part > 0:
             chain.append(part)
@@ -38,40 +42,45 @@ class Drag:
         self.size = float(np.ptp(body.model.template.vertices, axis=0).max())
 
     def drag_to(self, pose: np.ndarray, trans: np.ndarray, target: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Pose (J, 3) and trans (3,) that bring the vertex towards a target (3,), metres; the trunk moves as a whole.
+        """Compute pose (J, 3) and trans (3,) that bring the vertex towards a target (3,), metres.
 
-        A few Gauss-Newton steps, each taken only as far as the energy falls.
+        A few Gauss-Newton steps, each shortened until the energy falls. A vertex of the root part moves the whole body.
         """
         here = self.operator.evaluate(pose, trans)[0]
-        way = target - here                         # a point moves at most a quarter of the body's size at a time
+        way = target - here                         # at most a quarter of the body's size at a time
         target = here + way * min(1.0, 0.25 * self.size / max(float(np.linalg.norm(way)), 1e-9))
         if not len(self.columns):
             return pose, trans + target - here
 
-        def away(pose: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        def pose_residuals(pose: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+            """Return the distance of the turning joints from the start of the drag, and from the mean pose."""
             x = pose.ravel()[self.columns]
             return x - self.start[self.columns], x - self.mean[self.columns]
 
-        near = 0.01  # metres: a point this far from where it is wanted costs 1
+        near = 0.01  # metres: a point this far from its target costs 1
         def energy(pose: np.ndarray) -> float:
-            held, usual = away(pose)
-            off = (self.operator.evaluate(pose, trans)[0] - target) / near
-            return float(off @ off + HOLD * held @ self.precision @ held + USUAL * usual @ self.precision @ usual)
+            """Compute the weighted squares: distance from the target, and both priors."""
+            held, usual = pose_residuals(pose)
+            miss = (self.operator.evaluate(pose, trans)[0] - target) / near
+            return float(miss @ miss + HOLD * held @ self.precision @ held + USUAL * usual @ self.precision @ usual)
 
+        # four steps per mouse event suffice, as the next event goes on from here
         for _ in range(4):
             y, J = self.operator.jacobian(pose, trans)
-            off, J = (y[0] - target) / near, J[0][:, self.columns] / near
-            held, usual = away(pose)
+            miss, J = (y[0] - target) / near, J[0][:, self.columns] / near
+            held, usual = pose_residuals(pose)
             H = J.T @ J + (HOLD + USUAL) * self.precision
-            g = J.T @ off + self.precision @ (HOLD * held + USUAL * usual)
+            g = J.T @ miss + self.precision @ (HOLD * held + USUAL * usual)
             step = -np.linalg.solve(H + 1e-6 * np.trace(H) * np.eye(len(H)), g)
-            step *= min(1.0, 0.4 / max(float(np.abs(step).max()), 1e-12))         # radians that a joint turns at a time
+            step *= min(1.0, 0.4 / max(float(np.abs(step).max()), 1e-12))    # radians: largest turn of a joint
+            # take the longest of these fractions of the step that lowers the energy
             for shorter in (1, 3, 9, 27, 81):
-                tried = pose.copy()
-                tried.ravel()[self.columns] += step / shorter
-                if energy(tried) < energy(pose):
-                    pose = tried
+                candidate = pose.copy()
+                candidate.ravel()[self.columns] += step / shorter
+                if energy(candidate) < energy(pose):
+                    pose = candidate
                     break
+        # keep angles below half a turn
         out = pose.copy()
         out[1:] = twists(pose)[1:]
         return out, trans

@@ -1,4 +1,4 @@
-"""What a file or folder is, told by what is in it, and how it is shown."""
+"""Recognise files and folders by their contents, and how each is shown."""
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
@@ -29,18 +29,21 @@ from .motions import of_markers, of_motion, read_recording
 from .soft import soft_tissue_of, with_soft_tissue
 from .statues import read_statue
 
+# endings of files that belong to a mesh or model: landmarks and marker layouts
 PLACES = (".pp", ".json", ".lnd", ".landmarks.txt", ".landmarks.csv", ".fcsv")
+# files by which folders of commands are recognised
 COMPLETION, MOTION, SET = "completion.npz", "motion.npz", "set.json"
+# kinds of files that are shown from a folder
 SHOWN = ("surface", "picture", "model", "motion", "markers")
-DEEP = 3                             # folders inside folders that are looked into
+DEEP = 3                             # levels of folders to search: people, their recordings, and the results of these
 
 
 @dataclass(frozen=True, eq=False)
 class Entry:
-    """A thing that can be shown, read when it is.
+    """A thing that can be shown; it is read only then.
 
-    `first`: among those that are shown at first; `path`: what is read; `kind`: as `kind_of` tells it; `folder`: that a
-    command wrote and that it is of.
+    `first`: shown at the start. `path`: what is read. `kind`: as `viewable_kind` returns it. `folder`: the folder of a
+    command that it belongs to.
     """
 
     name: str
@@ -56,80 +59,83 @@ class Files:
 
     Parameters
     ----------
-    paths : Paths
+    paths : tuple of Path
+        Files and folders.
     model : Path, optional
-        Of motions that do not tell theirs.
+        Model of motions that do not name theirs.
     unit : str, optional
-        Of meshes, points, landmarks and markers.
+        Unit of meshes, points, landmarks and markers.
     over : bool
-        Recordings of markers are shown with the motions that were made of them, not by themselves.
-    rate : float, optional
-        Frames a second of motions and markers, where files do not say or say it wrongly.
+        Show recordings of markers with the motions made from them, not by themselves.
+    rate : float, frames per second, optional
+        Of motions and markers, where files do not say or say it wrongly.
     """
 
     def __init__(self, paths: tuple[Path, ...] = (), model: Path | None = None, unit: Unit | None = None,
                  over: bool = False, rate: float | None = None) -> None:
         self.paths, self.model, self.unit, self.over, self.rate = paths, model, unit, over, rate
         self._models: dict[Path, BodyModel] = {}
-        self.known: dict[str, tuple[Path, ...]] = {"model": (), "markers": ()}      # among the files
+        self.known: dict[str, tuple[Path, ...]] = {"model": (), "markers": ()}  # models and recordings among the files
 
     def entries(self) -> list[Entry]:
-        """All things, in order; ValueError for a file that is not there, or cannot be shown whatever is in it."""
-        found: list[Entry] = []
+        """List all things in order; ValueError for a missing file, or one that cannot be shown."""
+        entries: list[Entry] = []
         for path in self.paths:
             if not path.exists():
                 raise ValueError(f"{path}: no such file or folder")
-            if is_camera(path):                          # which is read with its picture
+            if is_camera(path):                          # it is read with its picture
                 picture, lacks = with_camera(path)
                 if lacks:
                     raise ValueError(f"{path}: expected its depth picture, {picture.name}, beside it; there is none")
                 if picture in self.paths:
                     continue
                 path = picture
-            if path.name in (ABOUT, CONTROL) and (path.parent / ABOUT).is_file():              # files of a statue
+            if path.name in (ABOUT, CONTROL) and (path.parent / ABOUT).is_file():   # a file of a statue: show it all
                 path = path.parent
             if path.name.lower().endswith(PLACES):
-                self._lay_on(found, path)
+                self._lay_on(entries, path)
             else:
-                found += self._of_folder(path) if path.is_dir() else [self._of_file(path, path.name)]
-        shared = f"{found[0].name.split('/')[0]}/" if found else ""
-        if len(found) > 1 and all(entry.name.startswith(shared) for entry in found):
-            found = [replace(entry, name=entry.name.removeprefix(shared)) for entry in found]
-        return found
+                entries += self._of_folder(path) if path.is_dir() else [self._of_file(path, path.name)]
+        # leave out a folder name that all entries share
+        shared = f"{entries[0].name.split('/')[0]}/" if entries else ""
+        if len(entries) > 1 and all(entry.name.startswith(shared) for entry in entries):
+            entries = [replace(entry, name=entry.name.removeprefix(shared)) for entry in entries]
+        return entries
 
     def with_another(self, entries: Sequence[Entry], path: Path) -> list[Entry]:
-        """Entries and those of one more file or folder, in the place of those that it had; ValueError as `entries`."""
+        """Return the entries with those of one more file or folder, which replace earlier ones of the same path."""
         self._models.pop(path.resolve(), None)
         self.known = {kind: tuple(one for one in paths if one != path) for kind, paths in self.known.items()}
         if path.name.lower().endswith(PLACES):
-            found = list(entries)
-            beside = [i for i, entry in enumerate(found) if landmarks_beside(entry.path) == path]
+            # landmarks: on the mesh that they lie beside, else on the last thing
+            changed = list(entries)
+            beside = [i for i, entry in enumerate(changed) if landmarks_beside(entry.path) == path]
             if beside:
-                found[beside[0]] = self._of_file(found[beside[0]].path, found[beside[0]].name)
+                changed[beside[0]] = self._of_file(changed[beside[0]].path, changed[beside[0]].name)
             else:
-                self._lay_on(found, path)
-            return found
+                self._lay_on(changed, path)
+            return changed
         fresh = self._of_folder(path) if path.is_dir() else [self._of_file(path, path.name)]
         old = [i for i, entry in enumerate(entries) if path in (entry.path, *entry.path.parents)]
         shared = f"{path.resolve().name}/"
-        if old and not entries[old[0]].name.startswith(shared):                               # named as they were
+        if old and not entries[old[0]].name.startswith(shared):     # keep the names they had
             fresh = [replace(entry, name=entry.name.removeprefix(shared)) for entry in fresh]
         place = old[0] if old else len(entries)
         return [*entries[:place], *fresh, *(entry for i, entry in enumerate(entries) if i > place and i not in old)]
 
     def folders(self, entries: Sequence[Entry]) -> list[Path]:
-        """Those that commands wrote and entries are of, and those that were named."""
+        """List folders written by commands that entries belong to, and folders that were named."""
         of_commands = [entry.folder for entry in entries if entry.folder is not None]
         return list(dict.fromkeys([*of_commands, *(path for path in self.paths if path.is_dir())]))
 
     @property
     def models(self) -> list[Path]:
-        """Those among the files, and last the one that was named for motions."""
+        """List the models among the files, and last the one named for motions."""
         named = [] if self.model is None else [self.model]
         return list(dict.fromkeys([*(path for path in self.known["model"] if path not in named), *named]))
 
     def read_model(self, path: Path) -> BodyModel:
-        """Each model is read once."""
+        """Read a model, each file once."""
         path = path.resolve()
         if path not in self._models:
             self._models[path] = load_model(path)
@@ -138,6 +144,7 @@ class Files:
     # files
 
     def _of_file(self, path: Path, name: str) -> Entry:
+        """Make the entry of a file, by its kind."""
         kind = viewable_kind(path)
         loads: dict[str, Callable[[], Content]] = {
             "model": lambda: of_model(name, self.read_model(path)),
@@ -154,19 +161,20 @@ class Files:
         return Entry(name, loads[kind], kind != "markers" or not self.over, path, kind)
 
     def _surface(self, path: Path, name: str) -> Content:
+        """Read a mesh or points with the landmarks beside them."""
         shape, file = read_shown_surface(path, self.unit), landmarks_beside(path)
         if file is None:
             return of_mesh(name, shape)
         try:
             return of_mesh(name, shape, read_landmarks(file, shape, self.unit))
-        except ValueError as problem:                    # a file of another kind that happens to have its name
+        except ValueError as problem:                    # a file of another kind with a name like landmarks
             return replace(of_mesh(name, shape), notes=(f"no landmarks beside {name}: {problem}",))
 
-    def _lay_on(self, found: list[Entry], path: Path) -> None:
-        """Landmarks, or a marker layout, on the thing that was named before them."""
-        if not found:
+    def _lay_on(self, entries: list[Entry], path: Path) -> None:
+        """Put landmarks, or a marker layout, on the thing named before them."""
+        if not entries:
             raise ValueError(f"{path}: landmarks and layouts are shown on a mesh or model; name that before them")
-        last = found.pop()
+        last = entries.pop()
 
         def load() -> Content:
             content = last.load()
@@ -176,17 +184,19 @@ class Files:
             still = (f"{path.name}: shown on the body at rest, without sliders",) * (content.model is not None)
             return replace(content, shapes=[*content.shapes, dots], model=None, notes=(*content.notes, *still))
 
-        found.append(replace(last, load=load))
+        entries.append(replace(last, load=load))
 
     # folders
 
     def _of_folder(self, folder: Path) -> list[Entry]:
+        """List the things of a folder."""
         entries = list(self._inside(folder, folder.resolve().name, DEEP))
         if not entries:
             raise ValueError(f"{folder}: expected meshes, a registered set, or what a command wrote; found none")
         return entries
 
     def _inside(self, folder: Path, name: str, deep: int) -> Iterator[Entry]:
+        """Yield the things of a folder: what a command wrote, else its files and folders."""
         if (folder / SET).is_file():
             yield from self._of_set(folder, name)
         elif (folder / ABOUT).is_file() and (folder / CONTROL).is_file():
@@ -207,20 +217,20 @@ class Files:
                     continue
                 if path.is_dir() and deep:
                     yield from self._inside(path, f"{name}/{path.name}", deep - 1)
-                # tables may hold anything, and BVH be of any body
+                # not by themselves: tables hold anything, and a BVH needs a model
                 elif path.is_file() and path.suffix.lower() not in (".csv", ".tsv", ".txt", ".bvh") \
                         and viewable_kind(path) in SHOWN:
                     yield self._of_file(path, f"{name}/{path.name}")
 
     def _of_set(self, folder: Path, name: str) -> Iterator[Entry]:
-        """The meshes of a registered set, worst first, of which the first is shown; then its template."""
-        whole = RegisteredSet.load(folder)
+        """Yield the meshes of a registered set, worst first, of which the first is shown; then the template."""
+        registered = RegisteredSet.load(folder)
 
         def load(label: str, path: Path) -> Content:
             return of_mesh(label, read_mesh(path, "m"))
 
-        for i, (scan, why) in enumerate(worst_first(whole)):
-            path = folder / next(entry.file for entry in whole.entries if entry.name == scan)
+        for i, (scan, why) in enumerate(worst_first(registered)):
+            path = folder / next(entry.file for entry in registered.entries if entry.name == scan)
             label = f"{name}/{scan}" + (f": {why}" if why else "")
             yield Entry(label, lambda label=label, path=path: load(label, path), i == 0, path,  # type: ignore[misc]
                         "of a set", folder)
@@ -230,6 +240,7 @@ class Files:
     # motions
 
     def _motion(self, path: Path, name: str) -> Content:
+        """Read a motion with its model, markers and soft tissue."""
         motion, model, notes = self._on_model(path)
         subject, markers = model.subject(motion.betas, np.float32), self._markers_of(path, motion)
         soft = soft_tissue_of(path, motion)
@@ -239,11 +250,11 @@ class Files:
         return with_soft_tissue(of_motion(name, motion, subject), soft, model, markers)
 
     def _on_model(self, path: Path) -> tuple[Motion, BodyModel, tuple[str, ...]]:
-        """A motion on its model, or on the one that was named; of another skeleton what is to be told."""
+        """Read a motion and its model; a motion of another skeleton is transferred, with notes about it."""
         if path.suffix.lower() == ".bvh" or read_motion_file(path, rate=self.rate).of_family:
             model = self._model_of(path)
-            found = read_motion(path, model, unit=self.unit, rate=self.rate)
-            return Motion.of(found), model, tuple(f"{path.name}: {m.name} {m.value}" for m in found.told)
+            transferred = read_motion(path, model, unit=self.unit, rate=self.rate)
+            return Motion.of(transferred), model, tuple(f"{path.name}: {m.name} {m.value}" for m in transferred.told)
         motion = Motion.load(path, self.rate)
         model = self._model_of(path, motion)
         parts = len(model.skeleton.parents)
@@ -256,18 +267,18 @@ class Files:
             raise ValueError(f"{problem}; name its own model with -m") from None
 
     def _markers_of(self, path: Path, motion: Motion) -> MarkerSequence | None:
-        """What was measured: the mended recording beside the motion, or one among the files that is laid over it."""
+        """Find the recording of a motion: the mended one beside it, or one among the files, laid over it."""
         virtual = path.with_name("virtual.c3d")
-        tried = [(virtual, None)] if virtual.is_file() and path.name == MOTION else []
-        for file, unit in [*tried, *((one, self.unit) for one in self.known["markers"] if self.over)]:
+        candidates = [(virtual, None)] if virtual.is_file() and path.name == MOTION else []
+        for file, unit in [*candidates, *((one, self.unit) for one in self.known["markers"] if self.over)]:
             markers = read_recording(file, unit, self.rate)
-            # labels that a recording and a motion have in common
+            # a recording of the same length that shares three labels or more
             if len(markers.positions) == len(motion.poses) and len({*markers.labels} & {*motion.labels}) >= 3:
                 return markers
         return None
 
     def _model_of(self, path: Path, motion: Motion | None = None) -> BodyModel:
-        """The model that was named, that the report beside the motion names, or one among the files."""
+        """Find the model of a motion: the named one, that of the report beside it, or one among the files."""
         if self.model is not None:
             return self.read_model(self.model)
         for folder in list(path.resolve().parents)[:DEEP]:

@@ -1,4 +1,4 @@
-"""What a file is, and what files beside others tell of them."""
+"""Kinds of files, and what other files beside them say about them."""
 from __future__ import annotations
 
 import zipfile
@@ -20,7 +20,7 @@ from ..mocap.marker_sets.layout import MarkerLayout
 
 
 def viewable_kind(path: Path) -> str:
-    """What a file is: model, motion, completion, markers, surface, picture, or words for what it is instead."""
+    """Return the kind of a file: model, motion, completion, markers, surface, picture, or a description of others."""
     if zipfile.is_zipfile(path):
         names = storage.names_in(path, "a model or a motion")
         if storage.HEADER not in names:
@@ -38,7 +38,7 @@ def viewable_kind(path: Path) -> str:
 
 
 def model_of_report(path: Path) -> Path | None:
-    """The model that a command's report names, where it is still there; None otherwise."""
+    """Return the model named in the report of a command, if it still exists; else None."""
     try:
         settings: Any = storage.read_json(path, "a report").get("settings", {})
         model = Path(str(settings["model"]))
@@ -47,20 +47,20 @@ def model_of_report(path: Path) -> Path | None:
     return model if model.is_file() or str(model) == BUILT_IN else None
 
 
-def worst_first(whole: RegisteredSet) -> list[tuple[str, str]]:
-    """Names and what is to be said of them; in the order of the set where there are no figures."""
+def worst_first(registered: RegisteredSet) -> list[tuple[str, str]]:
+    """Return names and main reason for doubt, worst first; in the order of the set where there are no figures."""
     from scanprep.pipeline.page import judge_set
 
     try:
-        verdicts = judge_set(whole.folder)
+        verdicts = judge_set(registered.folder)
     except (OSError, ValueError):
-        return [(name, "") for name in whole.names]
-    judged = {verdict.name: next(iter(verdict.reasons), "") for verdict in verdicts if verdict.name in whole.names}
-    return [*judged.items(), *((name, "") for name in whole.names if name not in judged)]
+        return [(name, "") for name in registered.names]
+    judged = {verdict.name: next(iter(verdict.reasons), "") for verdict in verdicts if verdict.name in registered.names}
+    return [*judged.items(), *((name, "") for name in registered.names if name not in judged)]
 
 
 def layout_places(path: Path, mesh: Mesh | None) -> dict[str, np.ndarray]:
-    """Where the markers of a layout are on a mesh; none of a file that is no layout."""
+    """Return where the markers of a layout are on a mesh; empty for a file that is not a layout."""
     if path.suffix.lower() != ".json" or mesh is None:
         return {}
     tree = storage.read_json(path, "landmarks or a layout")

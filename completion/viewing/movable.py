@@ -1,8 +1,8 @@
-"""A body whose shape and pose change from moment to moment, by sliders: a product of matrices at every move.
+"""A body whose shape and pose follow sliders: every move is a product of matrices.
 
-Vertices are affine in betas, `Y = Y_0(pose) + Σ_k Δβ_k D_k(pose)`. `D_k` is what the body gains by one standard
-deviation of component k; it is made when that slider is first moved. While the pose stands still, `Y_0` and `D_k` are
-kept and a move of a shape's slider is one multiplication of vertices.
+Vertices are affine in betas, `Y = Y_0(pose) + Σ_k Δβ_k D_k(pose)`. `D_k` is the change of the body per standard
+deviation of component k, computed when that slider is first moved. While the pose stays, `Y_0` and `D_k` are kept, and
+a move of a shape slider is one multiplication.
 """
 from __future__ import annotations
 
@@ -15,16 +15,17 @@ from model.linear import PointOperator, combination_weights
 from scanprep.geometry.mesh import Mesh
 from scanprep.skeleton.roles import in_words
 
-FEW = 3                              # differences beside the body at a new pose: for more it gets these betas itself
-KEPT = 24                            # differences of the body that are kept, those used last
+FEW = 3                              # differences to add at a new pose: for more, a new operator is faster
+KEPT = 24                            # differences kept in memory, the most recently used
 
 
 class MovableBody:
-    """A model with betas and a pose.
+    """A model with betas and pose.
 
     Parameters
     ----------
     model : BodyModel
+        The model.
     """
 
     def __init__(self, model: BodyModel) -> None:
@@ -36,12 +37,13 @@ class MovableBody:
         self.operator = model.operator(self.betas).astype(np.float32)
         self._differences: OrderedDict[int, PointOperator] = OrderedDict()
         self._pose = np.zeros((0, 3))
-        self._products: dict[int, np.ndarray] = {}                # at `_pose`; -1 is the body itself
+        self._products: dict[int, np.ndarray] = {}                # results at `_pose` by difference; -1 is the body
 
     def vertices(self, betas: np.ndarray | None, pose: np.ndarray, trans: np.ndarray | None = None) -> np.ndarray:
-        """(N, 3) float32, metres, relative to the root's joint, of betas (K,), or None, and a pose (J, 3); plus trans.
+        """Compute the vertices (N, 3) float32, metres, relative to the root's joint.
 
-        Relative to `origin`, so that single precision holds a few micrometres wherever the body is.
+        Shape betas (K,) or None, pose (J, 3) radians, and trans (3,), which is added. Positions are relative to
+        `origin`, so that single precision keeps a few micrometres wherever the body is.
         """
         moved = not np.array_equal(pose, self._pose)
         changed = self._find_changed(betas)
@@ -50,6 +52,7 @@ class MovableBody:
             changed, moved = np.zeros(0, dtype=np.int64), True
         if moved:
             self._pose, self._products = np.array(pose), {}
+        # the body, plus a difference for every changed beta
         y = self._product(-1).copy()
         for k in changed.tolist():
             assert betas is not None and self.betas is not None
@@ -60,41 +63,41 @@ class MovableBody:
 
     @property
     def origin(self) -> np.ndarray:
-        """(3,) metres: where the root's joint is when trans is zero."""
+        """(3,) float, metres: where the root's joint is when trans is zero."""
         return self.skeleton.joints[0]
 
     def point(self, vertex: int, betas: np.ndarray | None) -> PointOperator:
-        """One vertex of the body with these betas, as a function of the pose."""
+        """Return one vertex of the body with these betas as a function of the pose."""
         self._settle(betas)
         return self.operator.combine(combination_weights(self.operator.count, *self._below(vertex))).astype(np.float64)
 
     def _below(self, vertex: int) -> tuple[np.ndarray, np.ndarray | None]:
-        """The vertex of the model that it is, as for `Subject.points`."""
+        """Return the vertex of the model, in the form that `Subject.points` takes."""
         return np.array([vertex]), None
 
     @property
     def layers(self) -> tuple[MovableBody, ...]:
-        """The bodies that move with the sliders: this one."""
+        """Return the bodies that move with the sliders: this one."""
         return (self,)
 
     def joint(self, part: str, y: np.ndarray) -> np.ndarray:
-        """(1, 3) where a part's joint is in a body of vertices `y`, the ones that were made last."""
+        """Compute the joint of a part, (1, 3), from the latest vertices `y`."""
         return np.asarray(self.regressor[[self.parts.index(part)]] @ y)
 
     def mesh(self, betas: np.ndarray | None, pose: np.ndarray, trans: np.ndarray) -> Mesh:
-        """The body, made the exact way."""
+        """Compute the body with the exact model."""
         return self.model.template.with_vertices(self.model.vertices(pose, betas, trans))
 
     def _find_changed(self, betas: np.ndarray | None) -> np.ndarray | None:
-        """Which betas are not those of the operator; None where it has to be made again."""
+        """Return which betas differ from the operator's; None where it is faster to compute it again."""
         if betas is None or self.betas is None:
             return np.zeros(0, dtype=np.int64) if betas is None and self.betas is None else None
         changed = np.flatnonzero(betas != self.betas)
         missing = [k for k in changed.tolist() if k not in self._differences]
-        return changed if len(missing) < 2 else None               # to make all at once is quicker
+        return changed if len(missing) < 2 else None               # computing all at once is faster
 
     def _settle(self, betas: np.ndarray | None) -> None:
-        """Give the operator these betas."""
+        """Give the operator new betas."""
         changed = self._find_changed(betas)
         if changed is None or any(k not in self._differences for k in changed.tolist()):
             self.operator = self.model.operator(betas).astype(np.float32)
@@ -106,14 +109,14 @@ class MovableBody:
         self._pose, self._products = np.zeros((0, 3)), {}
 
     def _product(self, k: int) -> np.ndarray:
-        """(3, N) of the body, or of difference k, at the pose."""
+        """Compute the body, or difference k, at the present pose, (3, N)."""
         if k not in self._products:
             one, shift = (self.operator, self.origin) if k < 0 else (self._difference(k), np.zeros(3))
             self._products[k] = one.relative_positions(self._pose) + (one.origin - shift).astype(np.float32)[:, None]
         return self._products[k]
 
     def _difference(self, k: int) -> PointOperator:
-        """What the body gains by one standard deviation of component k."""
+        """Compute the change of the body per standard deviation of component k."""
         if k not in self._differences:
             unit = np.zeros(self.model.n_betas)
             unit[k] = 1

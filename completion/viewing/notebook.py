@@ -1,4 +1,4 @@
-"""Bodies that turn in a notebook, without a server and without a network."""
+"""Bodies that turn in a notebook, without server or network."""
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
@@ -26,12 +26,12 @@ from .motions import of_motion
 from .soft import of_soft_tissue
 from .statues import of_statue
 
-HEIGHT = 460                         # pixels of the bodies; buttons and legend stand below
+HEIGHT = 460                         # pixels; buttons and legend are below
 
 
 @dataclass(frozen=True, eq=False)
 class Viewed:
-    """What a notebook shows, and `write` puts into a file."""
+    """What a notebook shows, and `write` saves to a file."""
 
     contents: Sequence[Content]
     over: bool = False
@@ -39,14 +39,14 @@ class Viewed:
 
     @cached_property
     def html(self) -> str:
-        """A whole page."""
+        """The whole page as HTML."""
         up = None if self.up is None else AXES[self.up]
         _, panes = (over_each_other if self.over else arrange_side_by_side)(list(self.contents), up)
         page = Page("scapekit").bodies(panes, height=HEIGHT).html()
         return page.replace("<header><h1>scapekit</h1></header>\n", "").replace("<main>", '<main style="padding: 0">')
 
     def write(self, path: str | Path) -> None:
-        """The same as a page that can be opened by itself."""
+        """Write the page to a file that can be opened by itself."""
         from scanprep.geometry import storage
 
         storage.write_file(path, self.html)
@@ -57,27 +57,35 @@ class Viewed:
 
 
 def view(*things: Any, over: bool = False, up: str | None = None) -> Viewed:
-    """Things that a notebook shows and that can be turned there; where they are sent, no server is needed.
+    """Show things in a notebook, where they can be turned; no server is needed, also where the notebook is sent to.
 
     Parameters
     ----------
-    things
-        Meshes, points (n, 3), models, subjects, completions, statues, pairs of a motion and its subject or of soft
-        tissue and its model, and files or folders as `scape view` takes them.
+    *things : Mesh, (n, 3) array, BodyModel, Subject, Completion, Statue, tuple, str or Path
+        What is shown. A tuple is a motion and its subject, or soft tissue and its model; a str or Path is a file or
+        folder as `scape view` takes it.
     over : bool
-        Laid over each other instead of side by side.
+        Over each other instead of side by side.
     up : str, optional
         The axis that is up, such as "y" or "-y".
 
     Returns
     -------
     Viewed
-        The last line of a cell shows it; `.write("page.html")` keeps it.
+        The last line of a cell shows it; `.write("page.html")` saves it.
 
     Raises
     ------
     ValueError
-        Nothing to show, or of a kind that cannot be shown.
+        Nothing to show, or a kind of thing that cannot be shown.
+
+    Examples
+    --------
+    >>> from completion import view
+    >>> from scanprep.synthetic.people import SyntheticPerson
+    >>> page = view(SyntheticPerson().mesh, up="z")
+    >>> page.html.startswith("<!doctype html>")
+    True
     """
     if up is not None and up not in AXES:
         raise ValueError(f"up: expected one of {', '.join(AXES)}, got {up!r}")
@@ -88,7 +96,7 @@ def view(*things: Any, over: bool = False, up: str | None = None) -> Viewed:
 
 
 def _contents(thing: Any, name: str) -> list[Content]:
-    """What is seen of a thing; `name` is what tells it from others."""
+    """Return what is seen of a thing; `name` distinguishes it from others."""
     kinds: tuple[tuple[tuple[Any, ...], Callable[..., Content]], ...] = (
         ((Mesh | np.ndarray,), of_mesh), ((BodyModel,), of_model), ((Subject,), of_subject), ((Statue,), of_statue),
         ((Completion,), of_completion), ((Motion, Subject), of_motion), ((SoftTissue, BodyModel), of_soft_tissue))

@@ -1,4 +1,4 @@
-"""Pages that are reached from the view: which things offer which, and the apps that were opened."""
+"""Pages opened from the view: which things offer which, and the apps that were opened."""
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
@@ -19,12 +19,12 @@ from ..partial.work import CompletionTask
 from .files import Entry, Files
 from .saving import free_name
 
-PEOPLE = "built-in people"           # the model of those who have none
+PEOPLE = "built-in people"           # name of the model for people who have none
 Progress = Callable[[int, int], None]
 SCANS = ("surface", "picture")       # kinds of entries that can be completed
 
 
-# What commands wrote that can be mended: what the button says, and the app of such a folder.
+# Commands whose results can be corrected: text of the button, and the app for the folder.
 MENDED: Mapping[str, tuple[str, str]] = {
     "scape prep run": ("mend landmarks of", "scanprep.pipeline.mend:MendApp"),
     "scape complete": ("mend landmarks of", "completion.partial.mend:mend_completions"),
@@ -32,7 +32,7 @@ MENDED: Mapping[str, tuple[str, str]] = {
 
 
 class CompletePage(CompleteApp):
-    """Completion inside of the view: each body that is saved gets a folder of its own beside what is there."""
+    """Completion inside the view: each saved body gets a new folder of its own."""
 
     def __init__(self, model: BodyModel, work: CompletionTask, output: Path, dropped: Dropped) -> None:
         super().__init__(model, work, (), output, dropped=dropped)
@@ -41,14 +41,14 @@ class CompletePage(CompleteApp):
         self.fresh: list[Path] = []                       # folders written since the view was last shown
 
     def open(self, entry: Entry) -> None:
-        """Show a scan; as it was left, unless its file is another one now."""
+        """Show a scan, as it was left unless its file has changed."""
         if self.entries.get(entry.path) is not entry:
             self.entries[entry.path] = entry
             self.take(entry.path)
         self.on_open(lambda message: None, [one.path for one in self.scans].index(entry.path))
 
     def folder_of(self, scan: Clicked) -> Path:
-        """Where the body of a scan is saved."""
+        """Return the folder in which the body of a scan is saved."""
         if scan.path not in self._folders:
             self._folders[scan.path] = free_name(self.output / f"{scan.path.name.split('.')[0]}_completed")
         return self._folders[scan.path]
@@ -59,13 +59,16 @@ class CompletePage(CompleteApp):
 
 
 class Inside:
-    """The pages of a view; each is kept as it was left.
+    """The pages of a view; each keeps its state.
 
     Parameters
     ----------
     files : Files
-    output : folder for what is saved
-    dropped : files that were dropped on the view, which pages may be given
+        The files of the view.
+    output : Path
+        Folder for what is saved.
+    dropped : Dropped
+        Files dropped on the view, which pages may use.
     """
 
     def __init__(self, files: Files, output: Path, dropped: Dropped) -> None:
@@ -73,7 +76,7 @@ class Inside:
         self.opened: dict[tuple[str, Path | None], App] = {}
 
     def list_buttons(self, entries: Sequence[Entry]) -> dict[str, Any]:
-        """What the buttons are: pages of folders, and the scans and models of a completion, by number of the entry."""
+        """List the buttons: pages of folders, and scans and models for a completion."""
         commands = {folder: command_of(folder) for folder in self.files.folders(entries)}
         return {"folders": [{"page": "mend", "folder": str(folder),
                              "label": f"{MENDED[command][0]} {folder.resolve().name}"}
@@ -83,7 +86,7 @@ class Inside:
                            *({"path": str(path), "name": path.name} for path in self.files.models)]}
 
     def enter(self, entries: Sequence[Entry], wanted: Mapping[str, Any], progress: Progress) -> App:
-        """What was asked for of things: a page of a folder, or the completion of a scan.
+        """Open a page of a folder, or the completion of a scan.
 
         `wanted` has "what", the page, and either "folder", or "scan", its number, and "model", a file or "".
         """
@@ -99,6 +102,7 @@ class Inside:
         return self.opened[what, folder]
 
     def _completion(self, scan: Entry, model: str, progress: Progress) -> App:
+        """Open the page that completes scans with a model, and show a scan there."""
         if scan.kind not in SCANS:
             raise ValueError(f"{scan.name}: expected a scan, found {scan.kind}")
         path = next((path for path in self.files.models if str(path) == model), None)
@@ -121,11 +125,11 @@ class Inside:
 
     @property
     def completions(self) -> list[CompletePage]:
-        """Those that were opened."""
+        """The completion pages that were opened."""
         return [page for page in self.opened.values() if isinstance(page, CompletePage)]
 
     def folders_written(self, app: App) -> list[Path]:
-        """Folders that a page has written to since this was last asked."""
+        """Return folders that a page has written to since the last call."""
         if isinstance(app, CompletePage):
             fresh, app.fresh = app.fresh, []
             return list(dict.fromkeys(fresh))

@@ -1,4 +1,4 @@
-"""Bodies and poses of the sliders as files, never over one that is there."""
+"""Save bodies and poses of the sliders, never over an existing file."""
 from __future__ import annotations
 
 from collections.abc import Callable
@@ -14,19 +14,19 @@ from .movable import MovableBody
 
 
 def save_bodies(controls: Controls, folder: Path) -> list[Path]:
-    """Every body that is shown as `NAME_body.ply`, made the exact way."""
+    """Save every body that is shown as `NAME_body.ply`, computed with the exact model."""
     return _save(controls, folder, "body.ply", lambda path, body: write_mesh(
         path, body.mesh(controls.betas_of(body), controls.pose_of(body), controls.trans)))
 
 
 def save_poses(controls: Controls, folder: Path) -> list[Path]:
-    """Pose, place and shape of every body as `NAME_pose.npz`, a motion of one frame."""
+    """Save pose, place and shape of every body as `NAME_pose.npz`, a motion of one frame."""
     return _save(controls, folder, "pose.npz", lambda path, body: Motion(
         controls.pose_of(body)[None], controls.trans[None], controls.betas_of(body), 1.0, np.zeros((1, 0))).save(path))
 
 
 def _save(controls: Controls, folder: Path, ending: str, write: Callable[[Path, MovableBody], None]) -> list[Path]:
-    """A file of each body that lies below no other one."""
+    """Write a file for each body, except those that are inner layers of another."""
     written = []
     for one in controls.shown:
         if not any(one.body in other.body.layers[1:] for other in controls.shown):
@@ -36,8 +36,8 @@ def _save(controls: Controls, folder: Path, ending: str, write: Callable[[Path, 
 
 
 def free_name(path: Path) -> Path:
-    """The path, or the first with a number that is not there yet."""
-    tried, number = path, 2
-    while tried.exists():
-        tried, number = path.with_stem(f"{path.stem}_{number}"), number + 1
-    return tried
+    """Return the path, or the first one with a number that does not exist yet."""
+    candidate, number = path, 2
+    while candidate.exists():
+        candidate, number = path.with_stem(f"{path.stem}_{number}"), number + 1
+    return candidate

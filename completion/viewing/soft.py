@@ -1,4 +1,4 @@
-"""Soft tissue in the browser: a motion in which the shape changes, beside the same body of fixed shape."""
+"""Soft tissue in the browser: a motion with changing shape, beside the same body with fixed shape."""
 from __future__ import annotations
 
 from dataclasses import replace
@@ -17,16 +17,16 @@ from ..motion import Motion
 from .contents import Content
 from .motions import AT_ONCE, MADE, columns_of, of_motion, with_markers
 
-SOFT = (0.55, 0.66, 0.80)
+SOFT = (0.55, 0.66, 0.80)            # colour of the body with soft tissue, to tell it from the other
 
 
 def of_soft_tissue(name: str, soft: SoftTissue, model: BodyModel) -> Content:
-    """A motion with soft tissue, and the same with the person's own shape throughout, to be shown instead."""
+    """Show a motion with soft tissue; hidden at first, the same with the person's own shape throughout."""
     return with_soft_tissue(of_motion(name, soft.motion, model.subject(soft.motion.betas, np.float32)), soft, model)
 
 
 def soft_tissue_of(path: Path, motion: Motion) -> SoftTissue | None:
-    """What is stored in a motion's file of soft tissue, or lies beside a motion of as many frames; None without."""
+    """Read soft tissue from a motion's file, or from beside a motion of as many frames; None where there is none."""
     beside = [path.with_name("soft_tissue.npz")] if path.name == "motion.npz" else []
     for file in (path, *beside):
         if file.is_file() and SoftTissue.is_in(file):
@@ -37,12 +37,12 @@ def soft_tissue_of(path: Path, motion: Motion) -> SoftTissue | None:
 
 def with_soft_tissue(content: Content, soft: SoftTissue, model: BodyModel, markers: MarkerSequence | None = None
                      ) -> Content:
-    """A motion, whose body is hidden at first, and with it the body whose shape changes, and what was measured.
+    """Add the body with changing shape, and the markers, to a motion; the body with fixed shape is hidden at first.
 
-    Where the skin is soft is one of its colours: how far the change moves it, the root of the mean square over time.
+    One of its colourings shows how far soft tissue moves the skin, root mean square over time.
     """
-    some = spread_indices(len(soft.motion.poses), MADE)
-    frames = soft.vertices(model, some)
+    sample = spread_indices(len(soft.motion.poses), MADE)
+    frames = soft.vertices(model, sample)
     basis, coefficients = soft_columns(soft, model, frames)
     moved = soft.movement(model)
     shade = Heat(moved, 0.0, max(float(np.quantile(moved, 0.995)), 1e-3), "moved by soft tissue")
@@ -59,21 +59,23 @@ def with_soft_tissue(content: Content, soft: SoftTissue, model: BodyModel, marke
 
 
 def soft_columns(soft: SoftTissue, model: BodyModel, frames: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Columns (N, r) and coefficients (T, r, 3) of all vertices in all frames, from some of the frames (n, N, 3).
+    """Factor all vertices in all frames into columns (N, r) and coefficients (T, r, 3), from sample frames (n, N, 3).
 
-    As `as_columns` for a body of fixed shape: what the fast path adds up is linear in betas too, so every direction in
-    which they change adds a product of its own. Skin that moves on the body adds its displacements.
+    Like `as_columns` for a body of fixed shape. The fast path is linear in betas too, so every direction in which they
+    change adds a product of its own. Skin that moves on the body adds its displacements.
     """
     basis = columns_of(frames)
     own = soft.betas(0.0)[0]
+    # principal directions of the change of shape over time
     shares, sizes, directions = np.linalg.svd(soft.changes, full_matrices=False)
-    # standard deviations: a direction in which the shape changes less is left out
+    # 0.003 standard deviations: smaller changes of shape cannot be seen
     shares = (shares * sizes)[:, sizes > 0.003 * np.sqrt(len(soft.changes))]
     rest, whole = model.operator(own), basis.sum(axis=0)[:, None]
     gained = [model.operator(own + direction).plus(-1, rest) for direction in directions[:shares.shape[1]]]
-    amounts = np.hstack([np.ones((len(shares), 1)), shares])               # of each body, in every frame
+    amounts = np.hstack([np.ones((len(shares), 1)), shares])               # weight of each body, per frame
     poses = soft.motion.poses
     out = soft.motion.trans[:, :, None] * whole.T
+    # add up the products of all directions, some frames at a time
     for body, amount in zip((rest, *gained), amounts.T, strict=True):
         columns, origin = body.combine(basis.T), body.origin[:, None] * whole.T
         for i in range(0, len(poses), AT_ONCE):

@@ -1,4 +1,4 @@
-"""A statue behind sliders: its control mesh is posed, and the detail of the scan stands on the moved normals."""
+"""A statue with sliders: its control mesh is posed, and the detail of the scan follows the moved normals."""
 from __future__ import annotations
 
 from pathlib import Path
@@ -19,18 +19,19 @@ from scanprep.pictures.textures import bilinear
 from .contents import Content, Stance, sizes
 from .movable import MovableBody
 
-LEVEL = 3                            # of detail: 64 triangles for one of the control mesh; a move takes 1 to 4 ms
-FILLED = (0.55, 0.66, 0.80)
+LEVEL = 3                            # level of detail: 64 triangles for one of the control mesh; a move takes 1 to 4 ms
+FILLED = (0.55, 0.66, 0.80)          # colour of surface that fills a hole of the scan
 
 
 class MovableStatue(MovableBody):
-    """The exact surface of a statue in any pose of the model that moves its control mesh.
+    """The detailed surface of a statue in any pose of the model that moves its control mesh.
 
     Parameters
     ----------
     statue : Statue
+        The statue.
     model : BodyModel
-        Of the control mesh.
+        Model of its control mesh.
     """
 
     def __init__(self, statue: Statue, model: BodyModel) -> None:
@@ -44,34 +45,37 @@ class MovableStatue(MovableBody):
 
     @property
     def layers(self) -> tuple[MovableBody, ...]:
-        """The surface, and the control mesh below it."""
+        """Return the surface, and the control mesh below it."""
         return self, self.control
 
     def vertices(self, betas: np.ndarray | None, pose: np.ndarray, trans: np.ndarray | None = None) -> np.ndarray:
-        """(n, 3) float32, metres, of the detailed surface, relative to the root's joint. [Statues] Eq. 19, 20"""
+        """Compute the detailed surface (n, 3) float32, metres, relative to the root's joint.
+
+        [Statues] Eq. 19, 20
+        """
         self._control = super().vertices(betas, pose, trans)
         return self.detailed(self._control).astype(np.float32)
 
     def joint(self, part: str, y: np.ndarray) -> np.ndarray:
-        """Where a part's joint is in the control mesh below the vertices that were made last."""
+        """Compute the joint of a part in the control mesh of the latest vertices."""
         return super().joint(part, self._control)
 
     def mesh(self, betas: np.ndarray | None, pose: np.ndarray, trans: np.ndarray) -> Mesh:
-        """The detailed surface, made the exact way."""
+        """Compute the detailed surface with the exact model."""
         return self.detailed.mesh(self.model.vertices(pose, betas, trans))
 
     def _below(self, vertex: int) -> tuple[np.ndarray, np.ndarray | None]:
-        """The place of the control mesh below a vertex."""
+        """Return the place on the control mesh below a vertex."""
         return self._corners[[vertex]], self._bary[[vertex]]
 
 
 def movable(model: BodyModel, statue: Statue | None) -> MovableBody:
-    """What sliders move: a model's body, or the surface of a statue."""
+    """Return what sliders move: the body of a model, or the surface of a statue."""
     return MovableBody(model) if statue is None else MovableStatue(statue, model)
 
 
 def read_statue(name: str, folder: Path) -> Content:
-    """The statue of a folder, moved by the model beside it, which knows what poses people take."""
+    """Read the statue of a folder, with the model beside it, which knows the poses of people."""
     statue = load_statue(folder)
     model = load_model(folder / "body.npz") if (folder / "body.npz").is_file() else None
     same = model is not None and np.array_equal(model.template.faces, statue.control.mesh.faces)
@@ -79,11 +83,11 @@ def read_statue(name: str, folder: Path) -> Content:
 
 
 def of_statue(name: str, statue: Statue, model: BodyModel | None = None) -> Content:
-    """The surface of a statue where the scan stood, and its control mesh to be shown too."""
+    """Show the surface of a statue as the scan stood, and hidden at first its control mesh."""
     control = statue.control
     fine = subdivide_uniform(control.mesh, control.chart, LEVEL)
     mesh = Reconstruction(control, statue.map, fine).mesh()
-    # measured, folded, or filled where the scan has a hole
+    # colours for surface that was measured, folded over, or filled where the scan has a hole
     kind = coverage_at(control, statue.map, fine.parent, fine.bary)
     measured = np.array([CLAY, (0.93, 0.62, 0.12), FILLED])[
         np.select([kind == MEASURED, kind == FOLDED, kind == HOLE], [0, 1, 2])]

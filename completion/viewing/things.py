@@ -1,4 +1,4 @@
-"""The things of a view: which there are, what is known of them, and which are shown."""
+"""The things of a view: which exist, what is known of them, and which are shown."""
 from __future__ import annotations
 
 from collections.abc import Sequence
@@ -11,21 +11,21 @@ from .files import Entry, Files
 from .movable import MovableBody
 from .statues import movable
 
-MOST = 12                            # that are shown at a time
+MOST = 12                            # things shown at a time: more are too small to see
 T = TypeVar("T")
 
 
 class Things:
-    """Entries by their number, and for those that are shown what was read.
+    """Entries by number, and the contents of those that are shown.
 
     Attributes
     ----------
     entries : list of Entry
     shown : list of int
     contents, bodies : dict
-        What was read of those shown, and the bodies of those that are models.
+        Contents of the shown things, and the bodies of those that are models.
     problems, about : dict
-        Why one cannot be read; what is told of one that was.
+        Why a thing cannot be read; a description of one that was.
     """
 
     def __init__(self, entries: Sequence[Entry], files: Files) -> None:
@@ -37,7 +37,7 @@ class Things:
         self.about: dict[int, str] = {}
 
     def read(self, wanted: Sequence[int]) -> list[int]:
-        """Those of some entries that can be read."""
+        """Read entries; return those that could be read."""
         if len(wanted) > MOST:
             raise ValueError(f"at most {MOST} can be shown at a time")
         read: list[int] = []
@@ -59,20 +59,21 @@ class Things:
         return read
 
     def put(self, read: Sequence[int]) -> None:
-        """Show those that were read, and forget what was read of others."""
+        """Show what was read, and release the rest."""
         self.shown = list(read)
         self.contents = {i: self.contents[i] for i in read}
         self.bodies = {i: body for i, body in self.bodies.items() if i in read}
 
     def join(self, path: Path) -> None:
-        """Show the things of one more file or folder with the others; ValueError, and all as before, where none can be.
+        """Show the things of one more file or folder with the others; ValueError where none can be shown.
 
-        What is known of things that stay is kept; those that were shown and have changed are shown again.
+        After an error everything is as before. Things that stay keep their contents; those that have changed are read
+        again.
         """
         known = self.files.known
         before = self.entries, self.problems, self.contents, self.bodies, self.about
         try:
-            # numbers of the entries that stay; those that are new, or changed while they were shown
+            # new numbers of the entries that stay; entries that are new, or changed while shown
             entries = self.files.with_another(self.entries, path)
             place = {i: entries.index(entry) for i, entry in enumerate(self.entries) if entry in entries}
             fresh = [i for i in range(len(entries)) if i not in place.values()]
@@ -93,4 +94,5 @@ class Things:
 
 
 def _renumber(known: dict[int, T], place: dict[int, int]) -> dict[int, T]:
+    """Return a mapping with new numbers, without things that are gone."""
     return {place[i]: one for i, one in known.items() if i in place}

@@ -51,6 +51,7 @@ def coregister_scans(model: ModelArg, scans: ScansArg, output: Output, landmarks
     from scanprep.geometry.files import read_scan
 
     loaded, tasks = load_model(model), find_scans(scans, landmarks, subject)
+    # a scan that cannot be read is reported and stops no other
     read, marks, kept, failures = [], [], [], []
     for task in tasks:
         try:
@@ -80,7 +81,7 @@ def coregister_scans(model: ModelArg, scans: ScansArg, output: Output, landmarks
 
 
 def write_coregistered(folder: Path, first: BodyModel, tasks: Sequence[ScanTask], done: Coregistration) -> None:
-    """A registered set of the scans, the model learned from it, and a table of figures."""
+    """Write a registered set of the scans, the model learned from it, and a table of figures."""
     registered = {task: r for task, r in zip(tasks, done.registrations, strict=True) if r is not None}
     write_set(folder, first.template, [SetEntry(t.name, t.subject, t.pose, t.sex, mesh_file(t.name))
                                        for t in registered])
@@ -96,7 +97,7 @@ def write_coregistered(folder: Path, first: BodyModel, tasks: Sequence[ScanTask]
 
 
 def _figures(done: Coregistration, names: Sequence[str]) -> list[Metric]:
-    found = [r for r in done.registrations if r is not None]
+    made = [r for r in done.registrations if r is not None]
     bad = [name for name, fine in zip(names, done.good, strict=True) if not fine]
     return [Metric("scans registered", f"{int(done.good.sum())} of {len(done.good)}"),
             Metric("failed", ", ".join(bad) or "none"),
@@ -104,7 +105,7 @@ def _figures(done: Coregistration, names: Sequence[str]) -> list[Metric]:
             *(Metric(f"round {i}: failed", turn.failed) for i, turn in enumerate(done.history, 1)),
             *(Metric(f"round {i}: mean vertex moved", 1e3 * turn.change, "mm")
               for i, turn in enumerate(done.history, 1) if i > 1),
-            Metric("distance to the scan, median RMS", 1e3 * float(np.median([r.rms for r in found])), "mm"),
-            Metric("scan explained, mean", 100 * float(np.mean([r.explained for r in found])), "%"),
-            Metric("distance from the model, median RMS", 1e3 * float(np.median([r.apart for r in found])), "mm"),
-            Metric("inverted triangles", sum(r.inverted for r in found))]
+            Metric("distance to the scan, median RMS", 1e3 * float(np.median([r.rms for r in made])), "mm"),
+            Metric("scan explained, mean", 100 * float(np.mean([r.explained for r in made])), "%"),
+            Metric("distance from the model, median RMS", 1e3 * float(np.median([r.apart for r in made])), "mm"),
+            Metric("inverted triangles", sum(r.inverted for r in made))]

@@ -1,9 +1,9 @@
-"""Registration through a model: a body is found on a scan, and a template of any triangles goes along.
+"""Initialisation of a registration by a body model, for a template of any triangles.
 
-1. The model's body is fitted to the template, and laid on it (`fitting/search.py`): every vertex of the template gets a
-   place in a triangle of the body, and a distance from its skin. That is done once.
-2. On a scan the body is found by the same search.
-3. The template's vertices go where their places on the body are, and the template is registered from there on.
+1. Once: the model is fitted to the template and laid on it (`fitting/search.py`). Every template vertex gets a place in
+   a triangle of the body and a distance from its skin.
+2. The same search finds the model's body on a scan.
+3. The body carries the template's vertices to the scan, and the registration starts from there.
 """
 from __future__ import annotations
 
@@ -26,16 +26,16 @@ from ..fitting.search import Landmarks, ModelMismatchError, find_bodies, lay_mod
 from ..learning.config import LearnConfig
 from ..learning.scape import learn_scape
 
-# a first model of a set only has to find bodies: a tenth of the time of `scape learn`
+# the first model of a set only has to find bodies: these settings take a tenth of the time of `scape learn`
 LEARNING = LearnConfig(prunings=(0.01,), ridges=(0.003, 0.03), refinements=1)
 
 
 @dataclass(frozen=True, eq=False)
 class ModelLead:
-    """A model that leads a template to scans; made by `model_lead`.
+    """A model that initialises a template on scans; made by `model_lead`.
 
-    `corners` (N, 3) are vertices of the model, `weights` (N, 3) the place of each of the template's vertices among
-    them, and `off` (N,), metres, how far outside of the skin it lies there.
+    Each template vertex lies in a triangle of the model: `corners` (N, 3) are its vertices and `weights` (N, 3) the
+    barycentric coordinates. `off` (N,), metres, is the distance outside the skin.
     """
 
     name: str                        # of the model, or its file
@@ -45,27 +45,27 @@ class ModelLead:
     parts: PersonParts | None = None
 
     def carry(self, body: Mesh) -> np.ndarray:
-        """Where the template's vertices (N, 3), metres, are on a body."""
+        """Compute the template's vertices (N, 3), metres, on a body of the model."""
         ahead = normals_at(body, self.corners, self.weights)
         return np.einsum("nk,nkd->nd", self.weights, body.vertices[self.corners]) + self.off[:, None] * ahead
 
     def __call__(self, scan: Mesh | np.ndarray, landmarks: Landmarks | None = None, model: Path | None = None
                  ) -> Iterator[np.ndarray]:
-        """The template's vertices (N, 3) on the bodies of `find_bodies`; each is sought when it is asked for."""
+        """Yield the template's vertices (N, 3) on the bodies of `find_bodies`, each computed on demand."""
         marked = None
-        if landmarks is not None:              # of the model, the vertex that is nearest to each
+        if landmarks is not None:              # landmarks of the template become the nearest vertices of the model
             marked = self.corners[landmarks[0], self.weights[landmarks[0]].argmax(axis=1)], landmarks[1]
         body_model = model_at(self.name if model is None else model)
         return map(self.carry, find_bodies(body_model, scan, marked))
 
 
 def model_lead(template: Mesh, through: str, progress: Callable[[int, int], None] | None = None) -> ModelLead | None:
-    """A model that leads a template to scans, see `scanprep.registration.lead.lead_of`.
+    """Prepare a model that initialises a template on scans, see `scanprep.registration.lead.lead_of`.
 
     Parameters
     ----------
     template : Mesh
-        Of what the model is of, in a pose that the model's search finds.
+        Of the same kind of body as the model, in a pose that the model's search finds.
     through : str
         The file of a model, "people", or "auto": the built-in people, or None where the template is no person.
     progress : callable, optional
@@ -74,7 +74,7 @@ def model_lead(template: Mesh, through: str, progress: Callable[[int, int], None
     Raises
     ------
     ValueError
-        A model that does not come to lie on the template. StorageError for a file that is no model.
+        The model does not fit the template. StorageError for a file that is no model.
     """
     name = BUILT_IN if through == "auto" else through
     model = model_at(name)
@@ -95,13 +95,13 @@ def model_lead(template: Mesh, through: str, progress: Callable[[int, int], None
 
 
 def _in_same_triangles(model: BodyModel, template: Mesh) -> Mesh | None:
-    """The model's body on a template whose vertices are its own, or those of the synthetic people; None for others."""
+    """Find the model's body on a template with the model's triangles or the synthetic people's; None for others."""
     if np.array_equal(template.faces, model.template.faces):
         return template
-    kept = model.info.get("people_vertices")
-    if kept is None or not np.array_equal(template.faces, average_person().mesh.faces):
+    people_vertices = model.info.get("people_vertices")
+    if people_vertices is None or not np.array_equal(template.faces, average_person().mesh.faces):
         return None
-    return model.template.with_vertices(template.vertices[np.array(kept)])
+    return model.template.with_vertices(template.vertices[np.array(people_vertices)])
 
 
 def learn_set_model(template: Mesh, skeleton: Skeleton, poses: np.ndarray, shapes: np.ndarray | None, path: Path
@@ -111,13 +111,13 @@ def learn_set_model(template: Mesh, skeleton: Skeleton, poses: np.ndarray, shape
 
 
 def normals_at(body: Mesh, corners: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    """Unit normals (n, 3) of a body at places among its vertices, `corners` (n, 3) with `weights` (n, 3)."""
+    """Interpolate unit normals (n, 3) of a body at combinations of vertices `corners` (n, 3) by `weights` (n, 3)."""
     ahead = np.einsum("nk,nkd->nd", weights, body.vertex_normals[corners])
     return ahead / np.maximum(np.linalg.norm(ahead, axis=1, keepdims=True), 1e-12)
 
 
 def _parts(model: BodyModel, laid: Mesh, template: Mesh) -> PersonParts | None:
-    """The parts of a template on which a model of people was laid; None for other models."""
+    """Find the parts of a template on which a model of people was laid; None for other models."""
     if model.skeleton.names != PARTS:
         return None
     part = model.skeleton.part_of_face[Surface(laid).closest(template.corners.mean(axis=1)).faces]
@@ -127,7 +127,7 @@ def _parts(model: BodyModel, laid: Mesh, template: Mesh) -> PersonParts | None:
 
 
 def model_at(name: str | Path) -> BodyModel:
-    """The model of a name or a file, kept for the next scan as long as the file is the same."""
+    """Load a model by name or file; it is kept for the next scan as long as the file does not change."""
     path = Path(name)
     return _read(str(name), path.stat().st_mtime_ns if path.is_file() else 0)
 

@@ -1,4 +1,4 @@
-"""Rounds of registering all scans with a model and learning the model again from what comes of it."""
+"""Co-registration: rounds of registering all scans with a model and learning the model again [BlendSCAPE]."""
 from __future__ import annotations
 
 import contextlib
@@ -30,10 +30,11 @@ Lessons = tuple[np.ndarray, np.ndarray | None]       # poses (M, N, 3) of the te
 
 @dataclass(frozen=True)
 class Round:
-    """What one round brought.
+    """Figures of one round.
 
-    How many scans failed, the mean share of a scan's points that is explained, the median distance from mesh to model
-    (root mean square, metres), and how far the mean vertex moved since the round before, metres; NaN in the first.
+    `failed` scans; `explained`, the mean share of a scan's points near the mesh; `apart`, the median over scans of the
+    RMS distance from mesh to model, metres; `change`, how far the mean vertex moved since the round before, metres (NaN
+    in the first).
     """
 
     failed: int
@@ -44,19 +45,32 @@ class Round:
 
 @dataclass(frozen=True, eq=False)
 class Coregistration:
-    """All scans registered with one model, and the model learned from them.
+    """Result of `coregister`: all n scans registered with one model, and the model learned from them.
 
     Attributes
     ----------
-    registrations : ModelRegistration of every scan, or None
-        None where the scan could not be registered at all.
+    registrations : n of ModelRegistration or None
+        None where a scan could not be registered at all.
     good : (n,) bool
         Scans that have not failed; the model was learned from these.
     model : BodyModel
+        The model of the last round.
     rounds : int
+        Rounds that were done.
     converged : bool
+        Whether the last round moved the mean vertex less than the tolerance.
     history : tuple of Round
-    failures : name -> why a scan could not be registered at all
+        Figures of every round.
+    failures : dict of str to str
+        By the name of a scan, why it could not be registered at all.
+
+    Examples
+    --------
+    >>> done = Coregistration((), np.ones(3, dtype=bool), None, 2, True, ())
+    >>> int(done.good.sum()), done.converged
+    (3, True)
+
+    [BlendSCAPE]
     """
 
     registrations: tuple[ModelRegistration | None, ...]
@@ -70,7 +84,7 @@ class Coregistration:
 
 @dataclass(frozen=True, eq=False)
 class RegisterWithModel:
-    """The work on each scan of a round, with what one registration depends on; all else is at its defaults."""
+    """The task of registering one scan of a round; its fields are all that the result depends on."""
 
     model: BodyModel
     config: CoregistrationConfig
@@ -80,14 +94,14 @@ class RegisterWithModel:
         """The template's own body, made once for all scans."""
         return self.model.subject()
 
-    def __call__(self, given: OneScan, room: TaskContext) -> ModelRegistration:
-        body = self.person if given.own or not self.model.n_betas else self.model
-        return register_with_model(body, given.scan, given.landmarks, given.start, self.config)
+    def __call__(self, one: OneScan, room: TaskContext) -> ModelRegistration:
+        body = self.person if one.own or not self.model.n_betas else self.model
+        return register_with_model(body, one.scan, one.landmarks, one.start, self.config)
 
 
 @dataclass(frozen=True, eq=False)
 class OneScan:
-    """A scan and what is known of it before a round; `own` tells that it is of the template's person."""
+    """A scan and what is known of it before a round; `own` is True for scans of the template's person."""
 
     scan: Scan
     landmarks: Landmarks | None
@@ -100,46 +114,67 @@ def coregister(model: BodyModel, scans: Sequence[Scan], landmarks: Sequence[Land
                config: CoregistrationConfig | None = None, starts: Sequence[np.ndarray | None] | None = None,
                subjects: Sequence[str] | None = None, progress: Progress | None = None,
                names: Sequence[str] | None = None, space: Workspace | None = None) -> Coregistration:
-    """Register every scan with the model as prior, learn the model again from that, until it settles.
+    """Register every scan with the model as prior, learn the model again, and repeat until it converges.
 
-    With a `space` all work is kept there and found again. A registration depends on the scan, its landmarks, its
-    start and the model of its round, and a model on the registrations that taught it. So a scan that has changed is
-    alone registered anew in the first round; from the second on all are, if it taught the model. A scan that cannot
-    be registered stops no other.
+    A scan that cannot be registered stops no other. With a `space` all results are kept, and an interrupted run
+    resumes. A registration depends on the scan, its landmarks, its start and the model of its round. So after a change
+    of one scan, the first round registers only that scan again. Later rounds register all, if the model was learned
+    from it.
 
     Parameters
     ----------
     model : BodyModel
-        A first model, learned from whatever registrations there are.
-    scans : n Meshes or (k, 3) float, metres
-    landmarks : n pairs of (L,) int and (L, 3) float, metres, or None, optional
+        A first model of the kind scape or blendscape, learned from any registrations at hand.
+    scans : n of Mesh or (k, 3) float, metres
+        The scans, or bare points.
+    landmarks : n of ((L,) int, (L, 3) float, metres) or None, optional
+        Vertices of the template and their places on each scan.
     config : CoregistrationConfig, optional
+        Settings.
     starts : n of (N, 3) float, metres, or (J, 3) float, radians, or None, optional
         Earlier registrations, right or wrong, or poses.
-    subjects : n labels, optional
-        Whose scan each is. The one with the most is the template's own person, who teaches the poses; one scan of
-        each of the others teaches the shapes. Without labels all scans are of the template's person.
+    subjects : n of str, optional
+        Whose scan each is. The subject with the most scans is the template's own person, from whom poses are learned.
+        Shapes are learned from one scan of each other subject. Without labels all scans are of the template's person.
     progress : callable, optional
-        Called as progress(done, total), with scans registered of all rounds.
-    names : n labels, no two alike, optional
-        Of the scans, for messages and what is kept; numbers without.
+        Called as progress(done, total), counting registered scans of all rounds.
+    names : n of str, all different, optional
+        Names of the scans, for messages and kept results; numbers by default.
     space : Workspace, optional
+        Where results are kept.
+
+    Returns
+    -------
+    Coregistration
+        Registrations of all scans, the model, and the history of the rounds.
 
     Raises
     ------
     ValueError
-        Lists of different length, a model that cannot be learned again; fewer than two scans of the template's person
-        that have not failed.
+        Lists of different length, a model of another kind, or fewer than two good scans of the template's person.
+
+    Examples
+    --------
+    Two bodies of the built-in model, registered once with the model that they are from:
+
+    >>> from model import load_built_in_model
+    >>> model = load_built_in_model()
+    >>> try:
+    ...     coregister(model, [model.template], names=["one", "two"])
+    ... except ValueError as error:
+    ...     print(error)
+    names: expected 1, one a scan, got 2
 
     [BlendSCAPE]
     """
     config = config or CoregistrationConfig()
     n = len(scans)
-    for name, given in (("landmarks", landmarks), ("starts", starts), ("subjects", subjects), ("names", names)):
-        if given is not None and len(given) != n:
-            raise ValueError(f"{name}: expected {n}, one a scan, got {len(given)}")
+    for name, values in (("landmarks", landmarks), ("starts", starts), ("subjects", subjects), ("names", names)):
+        if values is not None and len(values) != n:
+            raise ValueError(f"{name}: expected {n}, one a scan, got {len(values)}")
     if model.kind not in ("scape", "blendscape"):
         raise ValueError(f"model: expected one of the kind scape or blendscape, got {model.kind}")
+    # what is not given: names are numbers, and there are no landmarks or starts
     labels = [f"scan {i}" for i in range(n)] if names is None else list(names)
     marks = list(landmarks) if landmarks is not None else [None for _ in scans]
     before: list[np.ndarray | None] = list(starts) if starts is not None else [None for _ in scans]
@@ -147,10 +182,12 @@ def coregister(model: BodyModel, scans: Sequence[Scan], landmarks: Sequence[Land
     good, registrations, failures = np.zeros(n, dtype=bool), list[ModelRegistration | None](), dict[str, str]()
     with workspace_or_temporary(space) as kept:
         while len(history) < config.rounds and not _has_settled(history, model, config):
+            # 1. register all scans with the model of this round
             turn, last = len(history), registrations
             ready = [OneScan(scans[i], marks[i], before[i], bool(own[i])) for i in range(n)]
             registrations, failures = _register_round(kept, model, ready, labels, config, turn, progress)
             good = np.array([r is not None and r.explained >= 1 - config.failed for r in registrations], dtype=bool)
+            # 2. learn the model again from the good registrations, which also start the next round
             lessons = _lessons(registrations, good, own, subjects, failures)
             history.append(_summary(registrations, good, last))
             model = _taught(kept, model, lessons, config, turn)
@@ -160,19 +197,19 @@ def coregister(model: BodyModel, scans: Sequence[Scan], landmarks: Sequence[Land
 
 
 def task_name(turn: int, name: str) -> str:
-    """What the registration of a scan is called among the results of a workspace; rounds count from 0."""
+    """Return the name of a scan's registration among the results of a workspace; rounds count from 0."""
     return f"round {turn + 1}/{name}"
 
 
 @contextlib.contextmanager
 def workspace_or_temporary(space: Workspace | None) -> Iterator[Workspace]:
-    """A workspace, or one that is gone at the end."""
+    """Yield the workspace, or else a temporary one."""
     with contextlib.ExitStack() as stack:
         yield space or stack.enter_context(workspace(stack.enter_context(tempfile.TemporaryDirectory())))
 
 
 def learn_again(model: BodyModel, poses: np.ndarray, shapes: np.ndarray | None, config: LearnConfig) -> BodyModel:
-    """A model of the same kind from registered poses (M, N, 3) of the template's person and others (S, N, 3)."""
+    """Learn a model of the same kind from poses (M, N, 3) of the template's person and other people (S, N, 3)."""
     bodies = np.concatenate([model.template.vertices[None], poses])
     learn = learn_blendscape if model.kind == "blendscape" else learn_scape
     learned: BodyModel = learn(model.template, bodies, shapes, model.skeleton, config)
@@ -181,7 +218,7 @@ def learn_again(model: BodyModel, poses: np.ndarray, shapes: np.ndarray | None, 
 
 
 def _own(subjects: Sequence[str] | None, n: int) -> np.ndarray:
-    """(n,) bool: scans of the template's person."""
+    """Find the scans of the template's person, (n,) bool: those of the subject with the most scans."""
     if subjects is None or not n:
         return np.ones(n, dtype=bool)
     most = max(dict.fromkeys(subjects), key=list(subjects).count)
@@ -191,35 +228,36 @@ def _own(subjects: Sequence[str] | None, n: int) -> np.ndarray:
 def _register_round(space: Workspace, model: BodyModel, scans: Sequence[OneScan], names: Sequence[str],
                     config: CoregistrationConfig, turn: int, progress: Progress | None
                     ) -> tuple[list[ModelRegistration | None], dict[str, str]]:
-    """One round of registrations, in the order of the scans, and by name why some could not be registered."""
+    """Register all scans once; return registrations in the order of the scans, and failures by name."""
     def tell(done: int, total: int) -> None:
         if progress is not None:
             progress(turn * total + done, config.rounds * total)
 
-    tasks = {name: Task(task_name(turn, name), given) for name, given in zip(names, scans, strict=True)}
+    tasks = {name: Task(task_name(turn, name), scan) for name, scan in zip(names, scans, strict=True)}
     with one_thread():
         one = CoregistrationConfig(fit=config.fit, registration=config.registration)
-        found = space.run(RegisterWithModel(model, one), list(tasks.values()), config.workers, tell)
-    return ([found.values.get(task.name) for task in tasks.values()],
-            {name: found.failures[task.name] for name, task in tasks.items() if task.name in found.failures})
+        results = space.run(RegisterWithModel(model, one), list(tasks.values()), config.workers, tell)
+    return ([results.values.get(task.name) for task in tasks.values()],
+            {name: results.failures[task.name] for name, task in tasks.items() if task.name in results.failures})
 
 
 def _taught(space: Workspace, model: BodyModel, lessons: Lessons, config: CoregistrationConfig, turn: int
             ) -> BodyModel:
-    """The model of a round."""
+    """Learn the model of a round, or take it from the workspace."""
     return space.step(f"model of round {turn + 1}", (model, lessons, config.learn),
                       lambda _: learn_again(model, *lessons, config.learn))
 
 
 def _lessons(registrations: Sequence[ModelRegistration | None], good: np.ndarray, own: np.ndarray,
              subjects: Sequence[str] | None, failures: Mapping[str, str]) -> Lessons:
-    """What teaches the model."""
+    """Collect what the model is learned from: good scans of the template's person, and one of every other subject."""
     vertices = {i: r.mesh.vertices for i, r in enumerate(registrations) if r is not None and good[i]}
     poses = [v for i, v in vertices.items() if own[i]]
     if len(poses) < 2:
         first = "".join(f"; {line}" for line in list(failures.values())[:1])
         raise ValueError(f"scans: only {len(poses)} of {int(own.sum())} of the template's person could be registered; "
                          f"at least 2 are needed to learn from{first}")
+    # reversed, so that the first good scan of a subject is the one that stays
     others = {subjects[i]: i for i in np.flatnonzero(good & ~own)[::-1].tolist()} if subjects is not None else {}
     shapes = np.stack([vertices[i] for i in others.values()]) if len(others) > 1 else None
     return np.stack(poses), shapes
@@ -241,14 +279,14 @@ def _has_settled(history: Sequence[Round], model: BodyModel, config: Coregistrat
 
 
 def coregistration_doubts(done: Coregistration, names: Sequence[str]) -> list[str]:
-    """Why co-registered scans, by name, are to be looked at: some do not fit the model."""
+    """List the co-registered scans, by name, that do not fit the model and should be looked at."""
     return [f"{name} does not fit the model" for name, fits in zip(names, done.good, strict=True) if not fits]
 
 
 def coregistration_problem(done: Coregistration, scans: Sequence[Scan]) -> str | None:
-    """Why co-registered scans mean nothing, with the likely cause; None where they mean something."""
+    """Explain why a co-registration is useless, with the likely cause; None where it is usable."""
     explained = float(np.mean([0.0 if r is None else r.explained for r in done.registrations]))
-    # mean share of the scans explained below which they mean nothing
+    # a model that explains less than half of the scans is not a model of them
     if done.good.any() and explained >= 0.5:
         return None
     spans = [extent(scan.vertices if isinstance(scan, Mesh) else scan) for scan in scans]

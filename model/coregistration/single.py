@@ -24,40 +24,55 @@ from ..linear import Subject
 from .config import CoregistrationConfig
 
 Landmarks = tuple[np.ndarray, np.ndarray]
-EXPLAINED = 0.006                    # share of √area: scan points so near to the mesh, facing alike, are explained
-# of the misfit of a start that explains its scan, below which another is better: of a crab, a body that lay the other
-# way round had 1.0 to 1.6 times the misfit of the right one
+EXPLAINED = 0.006                    # share of √area: scan points nearer to the mesh that face alike are explained
+# another start is better only below this share of the misfit of a given start that explains its scan. On crabs, bodies
+# turned the wrong way had 1.0 to 1.6 times the misfit of the right ones.
 CLEARLY = 0.8
 
 
 @dataclass(frozen=True, eq=False)
 class ModelRegistration:
-    """The template on a scan, and the model that led it there.
+    """Result of `register_with_model`: the template on a scan, and the fitted model.
 
     Attributes
     ----------
     mesh : Mesh
-        Follows the scan where there are data, the model along the surface and where there are none.
+        The registered template. It follows the scan where there are data; elsewhere, and along the surface, it follows
+        the model.
     predicted : Mesh
-        The model's own mesh.
-    pose, trans, betas : (J, 3), (3,) and (K,) float
-        No betas for a body of known shape.
+        The mesh of the fitted model.
+    pose : (J, 3) float, radians
+        Pose of the fitted model.
+    trans : (3,) float, metres
+        Place of the fitted model.
+    betas : (K,) float or None
+        Shape coefficients; None for a body of known shape.
     seen : (N,) bool
-        Whether there were data here.
+        Vertices with data.
     distances : (N,) float, metres
-        From each vertex that was seen to the surface of the scan; NaN for the others.
-    rms, landmark_rms : float, metres
-        Of these distances, and of those of the landmarks.
+        From each seen vertex to the surface of the scan; NaN for the others.
+    rms : float, metres
+        Root mean square of these distances.
     explained : float
-        Share of the scan's points that the mesh explains.
+        Share of the scan's points that are near the mesh.
     apart : float, metres
-        Root mean square distance of mesh and prediction where there were data; much of it tells of a wrong pose.
+        RMS distance of mesh and prediction where there were data; a large value means a wrong pose.
+    landmark_rms : float, metres
+        RMS distance of the landmarks from their vertices.
     inverted : int
-        Triangles that face against their surroundings.
+        Number of inverted triangles.
     confidence : (N,) float
-        From 0, made up by the model, to 1: there were data here.
+        From 0, predicted by the model, to 1, measured.
     starts : int
-        How many starts were tried.
+        Number of starts that were tried.
+
+    Examples
+    --------
+    >>> from dataclasses import fields
+    >>> [field.name for field in fields(ModelRegistration)][:3]
+    ['mesh', 'predicted', 'pose']
+
+    [BlendSCAPE]
     """
 
     mesh: Mesh
@@ -80,37 +95,54 @@ class ModelRegistration:
 def register_with_model(body: BodyModel | Subject, scan: Mesh | np.ndarray, landmarks: Landmarks | None = None,
                         start: np.ndarray | None = None, config: CoregistrationConfig | None = None,
                         progress: Callable[[int, int], None] | None = None) -> ModelRegistration:
-    """Bring the template onto a scan with a model of it as prior.
+    """Register the template to a scan with a model of it as prior.
 
-    1. Pose, place and betas are sought as in a partial scan: from several starts, with limbs tried elsewhere.
-    2. The template as the model predicts it is aligned with the scan, which it follows where there are data; along
-       the surface and elsewhere it keeps the predicted shape.
-    3. Pose and betas are taken from where the alignment has data.
+    1. Pose, place and betas are fitted as in scan completion: from several starts, with limbs re-initialised.
+    2. The predicted mesh is registered to the scan. It follows the scan where there are data; elsewhere, and along the
+       surface, it keeps the predicted shape.
+    3. Pose and betas are fitted to the registered vertices that have data.
 
     Parameters
     ----------
     body : BodyModel or Subject
         A model where the person's shape is unknown, a subject where it is known.
     scan : Mesh or (n, 3) float, metres
+        The scan, or bare points.
     landmarks : (L,) int and (L, 3) float, metres, optional
         Vertices of the template and where they are on the scan.
     start : (N, 3) float, metres, or (J, 3) float, radians, optional
-        An earlier registration, right or wrong, or a pose; others are sought where it does not explain the scan.
+        An earlier registration, right or wrong, or a pose. Other starts are tried where it does not explain the scan.
     config : CoregistrationConfig, optional
+        Settings.
     progress : callable, optional
         Called as progress(done, total).
+
+    Returns
+    -------
+    ModelRegistration
+        The registered mesh, the fitted model, and how well they explain the scan.
 
     Raises
     ------
     ValueError
         A scan, landmarks or a start that cannot be used.
 
+    Examples
+    --------
+    >>> from model import load_built_in_model
+    >>> subject = load_built_in_model().subject(None)
+    >>> try:
+    ...     register_with_model(subject, subject.template, start=np.zeros((3, 3)))
+    ... except ValueError as error:
+    ...     print(error)
+    start: expected finite vertices (5002, 3) or a pose (16, 3), got (3, 3)
+
     [BlendSCAPE]
     """
     config = config or CoregistrationConfig()
     tell = progress or (lambda done, total: None)
-    given: Landmarks = landmarks or (np.zeros(0, dtype=np.int64), np.zeros((0, 3)))
-    vertices, points = check_pairs(body.template, *given, "landmarks", 0)
+    marks: Landmarks = landmarks or (np.zeros(0, dtype=np.int64), np.zeros((0, 3)))
+    vertices, points = check_pairs(body.template, *marks, "landmarks", 0)
     target = target_of(scan)
     size, person = float(np.sqrt(body.template.face_areas.sum())), as_body(body)
     fit, factor = prepare_scan_fit(person, scan, vertices, points, config.fit)
@@ -134,28 +166,32 @@ def register_with_model(body: BodyModel | Subject, scan: Mesh | np.ndarray, land
 
 
 def _pose_and_shape(fit: ScanFit, given: np.ndarray | None) -> tuple[np.ndarray, int]:
-    """The best unknowns (P,) for a scan, and how many starts were tried: those given (1, P) first, all if need be."""
-    few, tried, best = fit.few(), 0, None
+    """Find the best unknowns (P,) for a scan; also return how many starts were tried.
+
+    A given start (1, P) is tried first; the others only if it does not explain the scan.
+    """
+    coarse, tried, best = fit.few(), 0, None
     if given is not None:
-        best, tried = reinitialise_limbs(few, best_starts(few, given)[0]), 1
-    # share of a scan that a start must explain for no other to be sought
-    explains = best is not None and few.find_unexplained(best, few.thin).mean() <= 1 - 0.98
-    if best is None or not explains or misplaced_limbs(few, best):
-        starts = first_starts(fit, few)
+        best, tried = reinitialise_limbs(coarse, best_starts(coarse, given)[0]), 1
+    # a given start that explains 98% of the scan and has no misplaced limb is enough
+    explains = best is not None and coarse.find_unexplained(best, coarse.thin).mean() <= 1 - 0.98
+    if best is None or not explains or misplaced_limbs(coarse, best):
+        starts = first_starts(fit, coarse)
         tried += len(starts)
-        other = with_limbs(fit, few, best_starts(few, starts))[0]
-        # a body that lies the other way round may explain a scan about as well: what was known decides
-        least = np.inf if best is None else (CLEARLY if explains else 1.0) * few.misfit(best)
-        best = other if best is None or few.misfit(other) < least else best
-    return solve_jointly(fit, few, best, lambda done: None).x, tried
+        other = with_limbs(fit, coarse, best_starts(coarse, starts))[0]
+        # a body turned the wrong way may explain a scan about as well, so the given start is preferred
+        least = np.inf if best is None else (CLEARLY if explains else 1.0) * coarse.misfit(best)
+        best = other if best is None or coarse.misfit(other) < least else best
+    return solve_jointly(fit, coarse, best, lambda done: None).x, tried
 
 
 def _unknowns_of_start(fit: ScanFit, start: np.ndarray, factor: float) -> np.ndarray:
-    """Unknowns (1, P) of a start given as vertices of the template or as a pose."""
+    """Compute the unknowns (1, P) of a start that is given as vertices of the template or as a pose."""
     start, body = np.asarray(start, dtype=np.float64), fit.body
     shapes = body.template.vertices.shape, body.pose_mean.shape
     if start.shape not in shapes or not np.isfinite(start).all():
         raise ValueError(f"start: expected finite vertices {shapes[0]} or a pose {shapes[1]}, got {start.shape}")
+    # rotations of the parts by Procrustes, or the pose itself; placed at the centroid of what is known
     registered = start.shape == shapes[0]
     onto = factor * start if registered else fit.cloud.points
     pose = body.skeleton.pose_of(body.skeleton.fit_rotations(body.template, onto)) if registered else start
@@ -165,13 +201,15 @@ def _unknowns_of_start(fit: ScanFit, start: np.ndarray, factor: float) -> np.nda
 
 
 def _predict_own_mesh(person: FixedBody, fit: ScanFit, x: np.ndarray) -> Mesh:
-    """A person's own mesh, of unknowns (P,) of a fit that may be of another size."""
+    """Compute the person's mesh, in metres, for unknowns (P,) of a fit that may use another size."""
     return person.template.with_vertices(person.vertices(fit.body.in_metres(x)[0]))
 
 
 def apart(mesh: Mesh, target: Target, limit: float) -> np.ndarray:
-    """Distances (n,) of scan points to the nearest place of a mesh, metres; at most `limit`, which it is where the two
-    face away from each other."""
+    """Compute distances (n,) of scan points to the nearest point of a mesh, metres, at most `limit`.
+
+    Points whose normal opposes that of the mesh get `limit`.
+    """
     found = Surface(mesh).closest(target.points)
     facing = np.einsum("nd,nd->n", mesh.face_normals[found.faces], target.normals) > 0
     return np.where(facing, np.minimum(found.distances, limit), limit)

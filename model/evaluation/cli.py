@@ -51,6 +51,7 @@ def evaluate(model: ModelArg, output: Output, poses: Path | None = None, shapes:
         raise UsageError("--train-shapes serves to judge people: give --shapes too")
     if shapes is not None and not loaded.n_betas:
         raise ValueError(f"{model}: it has no shape components, so it cannot be measured on people")
+    # bodies to measure on, in the model's triangles; then what each kind of them is measured for
     nothing: tuple[None, tuple[str, ...]] = (None, ())
     posed, pose_names = read_bodies(poses, loaded.template, unit, one_person=True) if poses else nothing
     people, people_names = read_bodies(shapes, loaded.template, unit) if shapes else nothing
@@ -111,17 +112,17 @@ def sample(model: ModelArg, output: Output, count: Annotated[Count, Alias("-n")]
         storage.write_json(output / f"{name}.pose.json",
                            dict(zip(loaded.skeleton.names, drawn.poses[i].tolist(), strict=True)))
     save_png(output / "sheet.png", picture_samples(loaded, drawn))
-    told = [Metric(WORDS[one], drawn.sexes.count(one)) for one in SEXES if one in drawn.sexes]
+    rows = [Metric(WORDS[one], drawn.sexes.count(one)) for one in SEXES if one in drawn.sexes]
     extent = np.ptp(drawn.vertices, axis=1).max(axis=1)
     return Outcome(output, [
-        Metric("bodies", count), *told, Metric("shape components", drawn.betas.shape[1]),
+        Metric("bodies", count), *rows, Metric("shape components", drawn.betas.shape[1]),
         Metric("largest extent, smallest body", float(extent.min()), "m"),
         Metric("largest extent, largest body", float(extent.max()), "m")],
         {"seed": seed, "pose_too": pose_too, "sex": sex}, judgement=Judgement())
 
 
 def _notes(model: BodyModel, posed: np.ndarray | None, people: np.ndarray | None) -> list[str]:
-    """Whether the bodies trained the model, as far as its file tells."""
+    """Write notes where the model was trained on the bodies, as far as its file says."""
     if posed is not None and model.info.get("digest") == digest(model.template, posed, people):
         return ["these are the very bodies that the model was trained on, so the errors are not held-out errors"]
     notes = []
@@ -165,7 +166,7 @@ def _about(what: str, errors: Errors, names: Sequence[str], converged: np.ndarra
 
 
 def _write_tables(output: Path, model: BodyModel, found: Findings) -> None:
-    """A row for every body, millimetres."""
+    """Write tables with a row for every body, millimetres."""
     parts = [f"{name}_mm" for name in model.skeleton.names]
     if found.poses is not None:
         rows = _rows(found.pose_names, found.poses.errors, found.poses.converged)

@@ -1,6 +1,6 @@
 """How good a model is: held-out errors of pose and shape, compactness.
 
-Every figure is made through the contract of `BodyModel` alone, so that kinds of model can be compared.
+All figures use only the common interface of `BodyModel`, so that kinds of model can be compared.
 """
 from __future__ import annotations
 
@@ -19,8 +19,10 @@ from ..linear import Subject
 
 @dataclass(frozen=True, eq=False)
 class Errors:
-    """Distances of corresponding vertices, metres: of each body (M,) the mean, 95th percentile and worst, the mean at
-    each vertex (N,), and the mean of each part of each body (M, J).
+    """Distances of corresponding vertices, metres.
+
+    For each body (M,) `mean`, 95th percentile `p95` and `worst`; the mean at each vertex, `by_vertex` (N,); and the
+    mean of each part of each body, `by_part` (M, J).
     """
 
     mean: np.ndarray
@@ -37,10 +39,9 @@ class Errors:
 
 @dataclass(frozen=True, eq=False)
 class PoseErrors:
-    """What is left of bodies after fitting pose and place: errors, poses (M, J, 3), trans (M, 3), which fits converged
-    (M,).
+    """Result of `pose_errors`: errors, fitted poses (M, J, 3), trans (M, 3), and which fits converged (M,).
 
-    `betas` are those of the body that was posed; None is the template's own.
+    `betas` are those of the body that was posed; None is the template's own body.
     """
 
     errors: Errors
@@ -50,18 +51,17 @@ class PoseErrors:
     converged: np.ndarray
 
     def vertices(self, model: BodyModel, i: int) -> np.ndarray:
-        """(N, 3) what the model made of body i, metres."""
+        """Compute the fitted vertices (N, 3) of body i, metres."""
         return model.vertices(self.poses[i], self.betas, self.trans[i])
 
 
 @dataclass(frozen=True, eq=False)
 class ShapeErrors:
-    """What is left of people after fitting shape, pose and place with several rising numbers of components, `counts`
-    (C,).
+    """Result of `shape_errors`, for several rising numbers of components, `counts` (C,).
 
-    For each count the errors after `fit_shape`, those with the pose held at that of the parts' own best rotations, and
-    those of plain principal components of the vertices of the training people, centred, None where none were given;
-    then betas (C, S, K), poses (C, S, J, 3), trans (C, S, 3) and which fits converged (C, S).
+    For each count it holds the `errors` after `fit_shape`, those with the pose held at the parts' Procrustes rotations
+    (`pose_held`), and those of plain PCA of centred vertices (`vertex_pca`; None without training people). Then betas
+    (C, S, K), poses (C, S, J, 3), trans (C, S, 3) and which fits converged (C, S).
     """
 
     counts: np.ndarray
@@ -74,12 +74,12 @@ class ShapeErrors:
     converged: np.ndarray
 
     def vertices(self, model: BodyModel, c: int, i: int) -> np.ndarray:
-        """(N, 3) what the model made of person i with the c-th number of components, metres."""
+        """Compute the fitted vertices (N, 3) of person i with the c-th number of components, metres."""
         return model.vertices(self.poses[c, i], self.betas[c, i], self.trans[c, i])
 
 
 def errors_between(model: BodyModel, made: Sequence[np.ndarray], truth: np.ndarray) -> Errors:
-    """The errors of bodies (N, 3) against what they should be (M, N, 3), metres."""
+    """Compute the errors of M fitted bodies (N, 3) against the true ones (M, N, 3), metres."""
     far = np.array([np.linalg.norm(y - x, axis=1) for y, x in zip(made, truth, strict=True)])
     of_part = np.eye(len(model.skeleton.parents))[model.skeleton.part_of_vertex(model.template)]       # (N, J)
     return Errors(far.mean(axis=1), np.percentile(far, 95, axis=1), far.max(axis=1), far.mean(axis=0),
@@ -88,23 +88,38 @@ def errors_between(model: BodyModel, made: Sequence[np.ndarray], truth: np.ndarr
 
 def pose_errors(model: BodyModel, bodies: np.ndarray, subject: Subject | None = None,
                 config: FitConfig | None = None, progress: Progress | None = None) -> PoseErrors:
-    """Error of one person's bodies after fitting pose and place.
+    """Compute the errors of one person's bodies after fitting pose and place.
 
     Parameters
     ----------
     model : BodyModel
+        The model to evaluate.
     bodies : (M, N, 3) float, metres
-        Registered, of the subject, best those that the model was not trained on.
+        Registered bodies of the subject, preferably not those that the model was trained on.
     subject : Subject, optional
-        Whose bodies they are; the template's own body when not given.
+        Whose bodies they are; by default the template's own body.
     config : FitConfig, optional
+        Settings of the fit.
     progress : callable, optional
-        Called with the bodies done and their number.
+        Called as progress(done, total), counting bodies.
+
+    Returns
+    -------
+    PoseErrors
+        Errors by body, vertex and part, and the fitted poses.
 
     Raises
     ------
     ValueError
-        Bodies of another count of vertices or not finite.
+        Bodies with another number of vertices or not finite.
+
+    Examples
+    --------
+    >>> from model import load_built_in_model, sample_poses
+    >>> model = load_built_in_model()
+    >>> bodies = model.subject(None).vertices(sample_poses(model, 2, np.random.default_rng(0)))
+    >>> pose_errors(model, bodies).errors.overall < 1e-3            # its own bodies, to a millimetre
+    True
     """
     bodies = check_bodies(model.template, bodies, "bodies")
     subject = subject or model.subject()
@@ -120,33 +135,49 @@ def pose_errors(model: BodyModel, bodies: np.ndarray, subject: Subject | None = 
 def shape_errors(model: BodyModel, people: np.ndarray, counts: Sequence[int] = (10, 20, 40),
                  train: np.ndarray | None = None, config: FitConfig | None = None,
                  progress: Progress | None = None) -> ShapeErrors:
-    """Error of people after fitting shape, pose and place: the curve of generalisation.
+    """Compute the errors of people after fitting shape, pose and place: the generalisation of the model.
 
     Parameters
     ----------
     model : BodyModel
-        With shape components.
+        A model with shape components.
     people : (S, N, 3) float, metres
-        Registered, best people that the model was not trained on.
-    counts : ints
+        Registered people, preferably not those that the model was trained on.
+    counts : sequence of int
         Numbers of components; more than the model has means all of them.
     train : (P, N, 3) float, metres, optional
-        The training people, for plain principal components of vertices as a yardstick.
+        The training people, for plain PCA of vertices to compare with.
     config : FitConfig, optional
+        Settings of the fit.
     progress : callable, optional
-        Called with the fits done and their number.
+        Called as progress(done, total), counting fits.
+
+    Returns
+    -------
+    ShapeErrors
+        Errors for every number of components, and the fitted betas and poses.
 
     Raises
     ------
     ValueError
-        People of another count of vertices or not finite, a count below 1, a model without shape components.
+        People with another number of vertices or not finite, a count below 1, a model without shape components.
+
+    Examples
+    --------
+    >>> from model import load_built_in_model
+    >>> model = load_built_in_model()
+    >>> person = model.vertices(np.zeros((16, 3)), np.array([1.0, -1.0, 0.5]))
+    >>> few, more = shape_errors(model, person[None], (1, 3), config=FitConfig(sample=200, polish=0)).errors
+    >>> more.overall < few.overall
+    True
     """
     people, wanted = check_bodies(model.template, people, "people"), check_counts(model, counts)
+    # one fitter for all counts; each count begins where the smaller one ended
     largest = ShapeFitter(model, replace(config or FitConfig(), n_betas=wanted[-1]))
     fitters = [largest.first(count) for count in wanted]
-    held, fits = [], list[list[ShapeFit]]()
+    held_pose, fits = [], list[list[ShapeFit]]()
     for done, person in enumerate(people):
-        held.append(fit_with_held_pose(model, person, wanted))
+        held_pose.append(fit_with_held_pose(model, person, wanted))
         fits.append([])
         for fitter in fitters:
             fits[-1].append(fitter.fit(person, fits[-1][-1] if fits[-1] else None))
@@ -158,7 +189,7 @@ def shape_errors(model: BodyModel, people: np.ndarray, counts: Sequence[int] = (
         return tuple(errors_between(model, bodies, people) for bodies in made)
 
     return ShapeErrors(
-        np.array(wanted), errors([f.vertices for f in row] for row in by_count), errors(zip(*held, strict=True)),
+        np.array(wanted), errors([f.vertices for f in row] for row in by_count), errors(zip(*held_pose, strict=True)),
         None if train is None else errors(_by_components(check_bodies(model.template, train, "train"), people,
                                                          wanted)),
         *(np.array([[getattr(f, name) for f in row] for row in by_count])
@@ -166,7 +197,7 @@ def shape_errors(model: BodyModel, people: np.ndarray, counts: Sequence[int] = (
 
 
 def fit_with_held_pose(model: BodyModel, person: np.ndarray, counts: Sequence[int]) -> list[np.ndarray]:
-    """Bodies (N, 3), metres, with betas and place fitted and the pose that of the parts' own best rotations.
+    """Fit betas and place with the pose held at the parts' Procrustes rotations: a body (N, 3), metres, for each count.
 
     Vertices are affine in betas, so this is linear least squares, and one normal matrix serves all counts.
     """
@@ -175,6 +206,7 @@ def fit_with_held_pose(model: BodyModel, person: np.ndarray, counts: Sequence[in
     by_shape = model.shape_jacobian(pose)[..., :K]
     mean = model.vertices(pose, np.zeros(K), np.zeros(3))
     assert by_shape.shape == (len(mean), 3, K) and pose.shape == (J, 3)
+    # the place is free, so all is centred
     centred, left = by_shape - by_shape.mean(axis=0), (person - mean) - (person - mean).mean(axis=0)
     columns = centred.reshape(-1, K)
     normal, slope = columns.T @ columns, columns.T @ left.ravel()
@@ -187,7 +219,8 @@ def fit_with_held_pose(model: BodyModel, person: np.ndarray, counts: Sequence[in
 
 
 def vertex_components(train: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Mean (3N,) and at most `count` plain principal components (k, 3N), orthonormal, of centred bodies (P, N, 3)."""
+    """Compute the mean (3N,) and at most `count` orthonormal principal components (k, 3N) of bodies (P, N, 3), centred.
+    """
     flat = (train - train.mean(axis=1, keepdims=True)).reshape(len(train), -1)
     mean = flat.mean(axis=0)
     flat -= mean
@@ -198,7 +231,7 @@ def vertex_components(train: np.ndarray, count: int) -> tuple[np.ndarray, np.nda
 
 
 def _by_components(train: np.ndarray, people: np.ndarray, counts: Sequence[int]) -> list[list[np.ndarray]]:
-    """For each count the people (S, N, 3) as plain principal components of the training people have them, centred."""
+    """Reconstruct people (S, N, 3) from plain principal components of the training people, for each count."""
     mean, components = vertex_components(train, max(counts))
     middles = people.mean(axis=1, keepdims=True)
     weights = ((people - middles).reshape(len(people), -1) - mean) @ components.T
@@ -207,12 +240,12 @@ def _by_components(train: np.ndarray, people: np.ndarray, counts: Sequence[int])
 
 
 def compactness(model: BodyModel) -> np.ndarray:
-    """(K,) share of the training people's variance of shape that the first 1..K components explain."""
+    """Return the share (K,) of the training people's shape variance that the first 1..K components explain."""
     return np.asarray(model.explained, dtype=np.float64)
 
 
 def check_counts(model: BodyModel, counts: Sequence[int]) -> list[int]:
-    """Numbers of components, rising, those beyond what the model has cut down to it, or ValueError."""
+    """Check numbers of components and return them in rising order, at most those of the model; else ValueError."""
     if not len(counts) or min(counts) < 1:
         raise ValueError(f"counts: expected numbers from 1 on, got {', '.join(map(str, counts)) or 'none'}")
     if not model.n_betas:
@@ -221,7 +254,7 @@ def check_counts(model: BodyModel, counts: Sequence[int]) -> list[int]:
 
 
 def errors_problem(errors: Errors, bodies: np.ndarray, model: BodyModel) -> str | None:
-    """Why the errors of bodies (M, N, 3) mean nothing, with the likely cause; None where they mean something."""
+    """Explain why the errors of bodies (M, N, 3) mean nothing, with the likely cause; None where they are plausible."""
     if errors.overall <= HAND * size(model.template):
         return None
     spans = [extent(body) for body in bodies]

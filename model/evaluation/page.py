@@ -26,7 +26,7 @@ Tell = Callable[[int, int], None]
 
 @dataclass(frozen=True, eq=False)
 class Findings:
-    """What was measured, None where it was not asked for, and on which bodies."""
+    """All results of an evaluation and the bodies they are of; None for what was not asked for."""
 
     poses: PoseErrors | None = None
     pose_names: tuple[str, ...] = ()
@@ -40,8 +40,7 @@ class Findings:
 
 def evaluation_page(name: str, model: BodyModel, found: Findings, metrics: Sequence[Metric],
                     notes: Sequence[str] = (), tell: Tell | None = None) -> Page:
-    """The page, self-contained: the closing table (metric, value, unit), what a reader must know, pictures and curves.
-    """
+    """Make the page, self-contained: notes, the table of metrics, pictures and curves."""
     page = Page(f"{name}, evaluated", f"A model of kind {model.kind} with {len(model.skeleton.parents)} parts and "
                 f"{model.n_betas} shape components, measured on bodies given to it.")
     for note in notes:
@@ -126,21 +125,21 @@ def _space_section(page: Page, model: BodyModel, found: Findings) -> None:
 
 
 def generalisation_rows(shapes: ShapeErrors) -> list[tuple[int, float, float, float, float, float]]:
-    """Components, then fitted, 95th percentile, worst vertex, pose held, vertex PCA (NaN without), millimetres."""
+    """List by components: fitted, 95th percentile, worst vertex, pose held, vertex PCA (NaN without), millimetres."""
     pca = [np.nan] * len(shapes.counts) if shapes.vertex_pca is None else [MM * e.overall for e in shapes.vertex_pca]
     return [(int(k), MM * e.overall, MM * float(e.p95.mean()), MM * float(e.worst.max()), MM * held.overall, plain)
             for k, e, held, plain in zip(shapes.counts, shapes.errors, shapes.pose_held, pca, strict=True)]
 
 
 def error_pane(body: Mesh, distance: np.ndarray, title: str) -> Pane:
-    """A body coloured by a distance (N,) in metres."""
+    """Draw a body coloured by a distance (N,) in metres."""
     high = _round_up(float(np.percentile(distance, 99.5)))
     return Pane([Solid(body, Heat(distance, 0.0, high, title))], look_around(body, turns=(20,))[0])
 
 
 def extreme_panes(model: BodyModel, errors: Errors, names: Sequence[str], bodies: np.ndarray,
                   make: Callable[[int], np.ndarray], poses: np.ndarray) -> list[Pane]:
-    """The best and the worst body as given, and beside each as fitted (`make(i)`), coloured by error.
+    """Draw the best and the worst body as given, and beside each the fitted one (`make(i)`), coloured by error.
 
     `poses` (M, J, 3) are those of the bodies.
     """
@@ -160,27 +159,27 @@ def extreme_panes(model: BodyModel, errors: Errors, names: Sequence[str], bodies
 
 
 def sample_panes(model: BodyModel, samples: Samples) -> list[Pane]:
-    """Random bodies, numbered."""
+    """Draw random bodies, numbered."""
     camera = look_around(model.template, samples.vertices, (25,))[0]
     return [Pane([model.template.with_vertices(v)], camera, str(i + 1)) for i, v in enumerate(samples.vertices)]
 
 
 def picture_samples(model: BodyModel, samples: Samples, height: int = 300) -> np.ndarray:
-    """A contact sheet of random bodies, numbered."""
+    """Picture random bodies on a contact sheet, numbered."""
     panes = sample_panes(model, samples)
     rows = max(1, round(np.sqrt(len(panes) / 2.5)))
     return picture_panes(panes, height, -(-len(panes) // rows))
 
 
 def _round_up(length: float) -> float:
-    """The next length whose quarters are round numbers, metres."""
+    """Return the next length whose quarters are round numbers, metres: the end of a colour scale."""
     power = 10.0 ** np.floor(np.log10(max(length, 1e-9)))
     steps = (1, 1.2, 1.6, 2, 2.4, 3.2, 4, 6, 8, 10)
     return float(power * min(step for step in steps if step * power >= length * (1 - 1e-9)))
 
 
 def _figure(width: float, height: float) -> tuple[Any, Any]:
-    """A matplotlib figure, inches, and its axes."""
+    """Make a matplotlib figure, sizes in inches, and its axes."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(width, height))
@@ -188,7 +187,7 @@ def _figure(width: float, height: float) -> tuple[Any, Any]:
 
 
 def chart_bodies(errors: Errors, names: Sequence[str]) -> Any:
-    """A matplotlib figure: mean and 95th percentile of every body, worst first."""
+    """Plot mean and 95th percentile of every body, worst first, as a matplotlib figure."""
     figure, axes = _figure(8.0, 2.8)
     order = np.argsort(-errors.mean)
     place = np.arange(len(order))

@@ -30,19 +30,22 @@ class Samples:
 
 def sample_bodies(model: BodyModel, count: int, rng: np.random.Generator, pose_too: bool = False,
                   n_betas: int | None = None, sex: Sex | None = None) -> Samples:
-    """Bodies with betas of the model's people: see `draw_betas`.
+    """Draw random bodies with betas of the model's people, see `draw_betas`.
 
     Parameters
     ----------
     model : BodyModel
+        The model to sample.
     count : int
-    rng : numpy Generator
+        Number of bodies.
+    rng : numpy.random.Generator
+        Source of the random numbers.
     pose_too : bool
-        Poses from the Gaussian of the training poses; else all stand at rest.
+        Draw poses from the Gaussian of the training poses; else all stand at rest.
     n_betas : int, optional
-        Vary the first components only.
+        Vary only so many first components.
     sex : {"female", "male"}, optional
-        Of a model that tells women from men; without it half of its bodies are women.
+        For a model that tells women from men; by default half of its bodies are women.
 
     Raises
     ------
@@ -75,11 +78,10 @@ def sample_bodies(model: BodyModel, count: int, rng: np.random.Generator, pose_t
 
 @dataclass(frozen=True, eq=False)
 class Specificity:
-    """How far random bodies of the model are from the nearest real person, for each number of components, `counts`
-    (C,).
+    """Result of `specificity`: how far random bodies are from the nearest real person, for C numbers of components.
 
-    The mean vertex distance (C, n), metres, of every random body to the training person nearest to it, which one that
-    is (C, n), and the mean over the training people of the distance to their nearest other, as a measure to compare
+    `distances` (C, n) are mean vertex distances, metres, of every random body to the nearest training person, `nearest`
+    (C, n) that person. `between_people` is the mean distance of training people to their nearest other, to compare
     with.
     """
 
@@ -92,26 +94,27 @@ class Specificity:
 def specificity(model: BodyModel, people: np.ndarray, count: int = 100, rng: np.random.Generator | None = None,
                 counts: Sequence[int] = (10, 20, 40), config: FitConfig | None = None,
                 progress: Progress | None = None) -> Specificity:
-    """Distance of random bodies of the model to the nearest training person.
+    """Measure the distance of random bodies of the model to the nearest training person.
 
-    Random bodies are drawn as `sample_bodies` does, and stand at rest. The people are brought to rest
-    by `unpose_people`, and all bodies are centred, before vertices are compared.
+    Random bodies are drawn as `sample_bodies` does, and stand at rest. People are brought to rest by `unpose_people`,
+    and all bodies are centred, before vertices are compared.
 
     Parameters
     ----------
     model : BodyModel
-        With shape components.
+        A model with shape components.
     people : (S, N, 3) float, metres
-        Registered, the people that the model was trained on.
+        Registered people that the model was trained on.
     count : int
         Random bodies for each number of components.
-    rng : numpy Generator, optional
-        The one of seed 0 when not given.
-    counts : ints
+    rng : numpy.random.Generator, optional
+        By default one with seed 0.
+    counts : sequence of int
         Numbers of components; more than the model has means all of them.
     config : FitConfig, optional
+        Settings of the fits.
     progress : callable, optional
-        Called with the people fitted and their number.
+        Called as progress(done, total), counting people.
 
     Raises
     ------
@@ -124,6 +127,7 @@ def specificity(model: BodyModel, people: np.ndarray, count: int = 100, rng: np.
         raise ValueError(f"count: expected at least 1, got {count}")
     if len(people) < 2:
         raise ValueError(f"people: expected at least 2, got {len(people)}")
+    # people at rest, the mean person and its change by the betas, all centred
     real = _centre(unpose_people(model, people, config, progress)).astype(np.float32)
     rest = np.zeros((len(model.skeleton.parents), 3))
     mean = _centre(model.vertices(rest, np.zeros(wanted[-1]))[None])[0]
@@ -142,10 +146,10 @@ def specificity(model: BodyModel, people: np.ndarray, count: int = 100, rng: np.
 def unpose_people(model: BodyModel, people: np.ndarray, config: FitConfig | None = None,
                   progress: Progress | None = None
                   ) -> np.ndarray:
-    """People (S, N, 3) at rest: `fit_shape` with all components, then the fitted body at zero pose.
+    """Bring people (S, N, 3) to the rest pose: `fit_shape` with all components, then the fitted body at zero pose.
 
-    What the fit leaves at every vertex is rotated back with the vertex's part and added, so that it is the person, not
-    the model's idea of the person, that comes to rest.
+    The residual of the fit at every vertex is rotated back with its part and added. So the result is the person and not
+    the model's approximation.
     """
     fitter, part = ShapeFitter(model, config), model.skeleton.part_of_vertex(model.template)
     rest = np.zeros((len(model.skeleton.parents), 3))
@@ -165,5 +169,5 @@ def _centre(bodies: np.ndarray) -> np.ndarray:
 
 
 def _distances_to(real: np.ndarray, body: np.ndarray) -> np.ndarray:
-    """Mean vertex distance (S,) of a body (N, 3) to each of (S, N, 3)."""
+    """Compute the mean vertex distance (S,) of a body (N, 3) to each of S bodies (S, N, 3)."""
     return np.array([np.sqrt(((person - body) ** 2).sum(axis=1)).mean(dtype=np.float64) for person in real])

@@ -1,4 +1,4 @@
-"""BVH, written: a skeleton with its motion, as animation programs have it; `motion.bvh` reads it."""
+"""Write BVH: a skeleton with its motion for animation programs; `motion.bvh` reads BVH."""
 from __future__ import annotations
 
 import warnings
@@ -23,22 +23,25 @@ def write_bvh(path: str | Path, skeleton: Skeleton, poses: np.ndarray | None = N
               rate: float = 30.0, unit: str = "cm", up: int = 2, body: Mesh | None = None) -> None:
     """Write a skeleton and its motion as BVH.
 
-    Offsets are those between the joints at rest, where all parts have the axes of the world. The root has six
-    channels, its place and its turn, the others three. Turns are Euler angles in degrees in the order Z, X, Y:
-    `R = R_z R_x R_y`. The root's offset is zero and its place is where its joint stands, so that readers who add
-    the two and readers who do not agree. Everything is turned so that y is up, as BVH readers expect.
+    Offsets are those between the joints at rest, where all parts have the axes of the world. The root has six channels
+    for place and rotation, the others three for rotation. Rotations are Euler angles in degrees in the order Z, X, Y:
+    `R = R_z R_x R_y`. The root's offset is zero and its channels hold its position. So readers that add the two and
+    readers that do not agree. Everything is turned so that y is up, as BVH readers expect.
 
     Parameters
     ----------
     path : str or Path
+        File to write.
     skeleton : Skeleton
         With the joints of the body that moves (`Rig.skeleton`, or the template's).
     poses : (T, J, 3) float, radians, optional
-        Without frames, one frame at rest is written.
+        Poses of all frames; without any, one frame at rest is written.
     trans : (T, 3) float, metres, optional
+        Travel of the root's joint.
     rate : float, frames a second
+        Frame rate.
     unit : "m", "cm", "mm" or "in"
-        Of the lengths in the file, which does not say it; readers expect centimetres.
+        Unit of the lengths, which the file does not say; readers expect centimetres.
     up : int
         0, 1 or 2: the axis of the body that points up.
     body : Mesh, optional
@@ -60,6 +63,7 @@ def write_bvh(path: str | Path, skeleton: Skeleton, poses: np.ndarray | None = N
     U = turn_up(up).T
     lines = ["HIERARCHY", *_hierarchy(skeleton, scale * skeleton.joints @ U, scale * part_ends(skeleton, body) @ U),
              "MOTION", f"Frames: {len(poses)}", f"Frame Time: {1 / rate:.9f}"]
+    # a row for each frame: position of the root, then angles of all joints in the order of the file
     places = scale * (skeleton.joints[0] + trans) @ U
     angles = euler_degrees(poses @ U)[:, _file_order(skeleton)]
     frames = np.concatenate([places, angles.reshape(len(poses), -1)], axis=1)
@@ -69,32 +73,32 @@ def write_bvh(path: str | Path, skeleton: Skeleton, poses: np.ndarray | None = N
 
 
 def euler_degrees(poses: np.ndarray) -> np.ndarray:
-    """Angles (T, J, 3) in degrees about z, x, y of poses (T, J, 3), without jumps of a full turn over time."""
+    """Convert poses (T, J, 3) to Euler angles (T, J, 3), degrees about z, x, y, without jumps of a full turn."""
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", UserWarning)      # where two axes fall together one of the answers is right
+        warnings.simplefilter("ignore", UserWarning)      # at gimbal lock any of the equivalent answers is right
         angles = Rotation.from_rotvec(poses.reshape(-1, 3)).as_euler(_ORDER, degrees=True)
     return np.unwrap(angles.reshape(poses.shape), axis=0, period=360)
 
 
 def part_ends(skeleton: Skeleton, body: Mesh | None = None) -> np.ndarray:
-    """(J, 3) the far end of every part, metres: of a leaf the tip of its surface at rest, seen along the part.
+    """Find the far end of every part (J, 3), metres: the tip of its surface at rest along the part.
 
-    Without a body the bone before a part is continued by its own length.
+    Without a body, the end continues the bone before the part by its own length.
     """
     joints, parents = skeleton.joints, skeleton.parents
     ends = 2 * joints - joints[np.maximum(parents, 0)]
     for j in range(len(parents) if body is not None else 0):
         assert body is not None
-        mine = body.vertices[np.unique(body.faces[skeleton.part_of_face == j])] - joints[j]
-        along = mine.mean(axis=0)
+        skin = body.vertices[np.unique(body.faces[skeleton.part_of_face == j])] - joints[j]
+        along = skin.mean(axis=0)
         length = float(np.linalg.norm(along))
         if length > 0:
-            ends[j] = joints[j] + along / length * max(float((mine @ along).max()) / length, length)
+            ends[j] = joints[j] + along / length * max(float((skin @ along).max()) / length, length)
     return ends
 
 
 def _file_order(skeleton: Skeleton) -> list[int]:
-    """The joints in the order of the file: every joint is followed by all that hangs below it."""
+    """List the joints in the order of the file: every joint is followed by all that hangs below it."""
     order: list[int] = []
     waiting = [0]
     while waiting:
@@ -106,6 +110,7 @@ def _file_order(skeleton: Skeleton) -> list[int]:
 
 def _hierarchy(skeleton: Skeleton, joints: np.ndarray, ends: np.ndarray) -> list[str]:
     lines: list[str] = []
+    # braces that are still open are closed until the parent of the next joint is the innermost one
     level = np.zeros(len(joints), dtype=int)
     open_joints: list[int] = []
     for j in _file_order(skeleton):
@@ -129,7 +134,7 @@ def _offset(offset: np.ndarray) -> str:
 
 
 def _numbers(rows: np.ndarray) -> list[str]:
-    """Lines of numbers (T, K), none of which is a negative zero."""
-    digits = 8  # after the point: in any unit finer than a tenth of a micrometre
+    """Format numbers (T, K) as lines, without negative zeros."""
+    digits = 8  # decimals: finer than a tenth of a micrometre in any unit
     zero = f"{0:.{digits}f}"
     return [line.replace(f"-{zero}", zero) for line in number_lines(rows, f"%.{digits}f", " ")]

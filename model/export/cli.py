@@ -33,7 +33,9 @@ from .correctives import motion_correctives, off_exact, pose_features, write_bod
 from .glb import write_skinned_glb
 from .names import Names, names_of
 
-MEASURED = 40                        # poses in which the files are compared with the exact model
+MEASURED = 40                        # poses or frames in which the files are compared with the exact model
+
+
 def export(model: ModelArg, output: Output, betas: tuple[Beta, ...] = (), own_body: bool = False,
            motion: Path | None = None, shapes: Annotated[int | None, Called("--morphs")] = None,
            correctives: int | None = None, unit: Unit | None = None, up: Literal["x", "y", "z"] | None = None,
@@ -70,7 +72,7 @@ def export(model: ModelArg, output: Output, betas: tuple[Beta, ...] = (), own_bo
         fps: Frames a second of the motion, such as 24 or 30; else as many as its file has.
         rate: Frames a second of the motion's file, where it does not say or says it wrongly.
     """
-    # how the output is written, and whether all that was asked for says something about it
+    # the writer for the name of the output; options that say nothing about this kind of file are an error
     ending = max((ending for ending in WRITERS if output.name.lower().endswith(ending)), key=len)
     if not ending and name_of(output) != output.name and not output.is_dir():
         raise ValueError(f"{output}: expected a name ending in {', '.join(filter(None, WRITERS))}, or a folder")
@@ -101,7 +103,7 @@ def export(model: ModelArg, output: Output, betas: tuple[Beta, ...] = (), own_bo
 
 @dataclass(frozen=True, eq=False)
 class Order:
-    """What is to be written, as the arguments of `export` say."""
+    """What to write, from the arguments of `export`."""
 
     output: Path
     path: Path                       # of the model
@@ -118,7 +120,7 @@ class Order:
     front: bool
 
     def motion(self, what: str) -> BodyMotion:
-        """The motion, without which there is nothing to write."""
+        """Return the motion; ValueError where none was named."""
         if self.moves is None:
             raise ValueError(f"{self.output}: expected a motion for {what}; name it with --motion")
         return self.moves
@@ -126,7 +128,7 @@ class Order:
 
 def write_frames(folder: str | Path, subject: Subject, poses: np.ndarray, trans: np.ndarray | None = None,
                  ending: str = ".ply", progress: Progress | None = None) -> list[Path]:
-    """Write the exact mesh of every frame, 00000.ply, 00001.ply, ...; the files in the order of the frames."""
+    """Write the exact mesh of every frame, 00000.ply, 00001.ply, ...; return the files in the order of the frames."""
     paths = []
     for t, pose in enumerate(poses):
         paths.append(Path(folder) / f"{t:05d}{ending}")
@@ -138,7 +140,7 @@ def write_frames(folder: str | Path, subject: Subject, poses: np.ndarray, trans:
 
 
 def _mesh(order: Order) -> list[Metric]:
-    """The body at rest."""
+    """Write the mesh of the body at rest."""
     model = order.model
     rest = np.zeros((len(model.skeleton.parents), 3))
     body = model.template.with_vertices(model.vertices(rest, order.person))
@@ -147,7 +149,7 @@ def _mesh(order: Order) -> list[Metric]:
 
 
 def _npz(order: Order) -> list[Metric]:
-    """The model as linear blend skinning; with a motion, that motion as AMASS has it."""
+    """Write the model as linear blend skinning; with a motion, that motion under the names of AMASS."""
     model, moves = order.model, order.moves
     if moves is not None:
         family = str(model.info.get("family") or "")
@@ -160,6 +162,7 @@ def _npz(order: Order) -> list[Metric]:
     arrays = write_body_npz(order.output, model)
     mean = np.zeros(1) if model.n_betas else None
     rig = make_rig(model, mean)
+    # the error against the exact model, with and without pose correctives
     poses = sample_poses(model, MEASURED, np.random.default_rng(1))      # not those of the fit
     exact = model.subject(mean).vertices(poses)
     changes = np.tensordot(pose_features(poses), arrays["posedirs"], axes=(1, 2))
@@ -173,7 +176,7 @@ def _npz(order: Order) -> list[Metric]:
 
 
 def _folder(order: Order) -> list[Metric]:
-    """The exact mesh of every frame, in a file of its own."""
+    """Write the exact mesh of every frame, each in its own file."""
     subject, moves = order.model.subject(order.person), order.motion("a folder of meshes")
     with bar("writing meshes") as progress:
         paths = write_frames(order.output, subject, moves.poses, moves.trans, progress=progress)
@@ -182,21 +185,21 @@ def _folder(order: Order) -> list[Metric]:
 
 
 def _bvh(order: Order) -> list[Metric]:
-    """The skeleton and its motion."""
+    """Write the skeleton and its motion as BVH."""
     rig = make_rig(order.model, order.person)
     where, poses, frames = _poses_to_measure(order)
     off = joint_places(rig.skeleton, poses[frames]) - order.model.subject(order.person).joints(poses[frames])
-    told = _write_rig(order, rig, lambda ready, poses, trans, rate, up: write_bvh(
+    rows = _write_rig(order, rig, lambda ready, poses, trans, rate, up: write_bvh(
         order.output, ready.skeleton, poses, trans, rate, order.unit, up, ready.mesh))
-    return [*told, Metric("unit", order.unit), where,
+    return [*rows, Metric("unit", order.unit), where,
             *_distances("joints of the exact body", np.linalg.norm(off, axis=-1))]
 
 
 def _skin(order: Order, write: Callable[..., None]) -> list[Metric]:
-    """A body that hangs on joints, with morph targets of betas and, in a motion, of what skinning lacks."""
+    """Write a skinned body with morph targets for betas and, in a motion, for what skinning lacks."""
     shapes, moves = order.shapes, order.moves
     if shapes is None:
-        # morph targets where nobody says how many
+        # ten betas by default: more sliders are hard to use
         shapes = 0 if order.person is None else min(10, order.model.n_betas)
     rig, subject = make_rig(order.model, order.person, shapes), order.model.subject(order.person)
     if moves is None and order.correctives:
@@ -211,7 +214,7 @@ def _skin(order: Order, write: Callable[..., None]) -> list[Metric]:
 
 
 def _poses_to_measure(order: Order) -> tuple[Metric, np.ndarray, np.ndarray]:
-    """Where a rig is compared with the exact body: of which poses (T, J, 3), and in which frames (n,) of them."""
+    """Choose where a rig is compared with the exact body: poses (T, J, 3), and frames (n,) of them."""
     if order.moves is None:
         poses = sample_poses(order.model, MEASURED, np.random.default_rng(0))
         return Metric("measured on", f"{MEASURED} poses of the prior"), poses, np.arange(MEASURED)
@@ -220,19 +223,19 @@ def _poses_to_measure(order: Order) -> tuple[Metric, np.ndarray, np.ndarray]:
 
 
 def _write_rig(order: Order, rig: Rig, write: Callable[..., None]) -> list[Metric]:
-    """Write a rig and its motion as other programs want them, and say what became of the skeleton."""
+    """Write a rig and its motion in the conventions of other programs; return figures of the skeleton."""
     axis = guess_upright(rig.mesh)[0] if order.up is None else order.up
     rest = np.zeros((0, len(rig.skeleton.parents), 3))
     moves = order.moves or BodyMotion(rest, rest[:, 0], order.person, 30.0)
     ready, poses, trans = for_programs(rig, moves.poses, moves.trans, axis, order.root, order.names, order.ground,
                                        order.front)
     write(ready, poses if len(poses) else None, trans, moves.rate, up=axis)
-    # parts that keep their names although others were asked for
+    # report parts that have no name in the other program and keep ours
     known = {} if order.names is None else names_of(rig.skeleton, order.names)
-    kept = [name for name in rig.skeleton.names if name not in known]
+    ours = [name for name in rig.skeleton.names if name not in known]
     return [_size(order.output), *moves.told, Metric("joints", len(ready.skeleton.names)),
             Metric("root", ready.skeleton.names[0]),
-            *([Metric(f"parts without a name of {order.names}", ", ".join(kept))] if order.names and kept else []),
+            *([Metric(f"parts without a name of {order.names}", ", ".join(ours))] if order.names and ours else []),
             Metric("up", "xyz"[axis]), Metric("frames", len(poses))]
 
 
@@ -248,7 +251,7 @@ def _size(path: Path) -> Metric:
 
 
 class Writer(NamedTuple):
-    """How a kind of file is written, and what of the command line says anything about it."""
+    """A kind of file: which options of the command line apply to it, and the function that writes it."""
 
     kind: str
     takes: set[str]
@@ -258,7 +261,7 @@ class Writer(NamedTuple):
 _PLACED = {"betas", "own_body", "up", "ground", "front"}
 _BONES = _PLACED | {"motion", "fps", "rate", "root", "names"}
 _MOVES = {"betas", "own_body", "motion", "fps", "rate"}
-# by the ending of the output's name; without one it is a folder
+# writers by the ending of the output's name; without an ending the output is a folder
 WRITERS = {
     ".glb": Writer("glb", _BONES | {"morphs", "correctives"}, partial(_skin, write=write_skinned_glb)),
     ".bvh": Writer("bvh", _BONES | {"unit"}, _bvh),

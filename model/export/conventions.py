@@ -1,4 +1,4 @@
-"""What animation programs expect: root, names, bones along the limbs, soles on the ground, face to the viewer."""
+"""Conventions of animation programs: root, names, bones along the limbs, soles on the ground, face to the viewer."""
 from __future__ import annotations
 
 from dataclasses import replace
@@ -18,17 +18,19 @@ from .names import Names, rename_bones
 def for_programs(rig: Rig, poses: np.ndarray, trans: np.ndarray, up: int, root: str | None = None,
                  names: Names | None = None, ground: bool = False, front: bool = False
                  ) -> tuple[Rig, np.ndarray, np.ndarray]:
-    """The same body and motion as animation programs expect them; what GLB and BVH files are written from.
+    """Convert a body and its motion to the conventions of animation programs, for GLB and BVH files.
 
-    The surface moves as before, but for `ground` and `front`, which place the whole anew. Bones get axes along the
-    limbs (`aim_bones`).
+    The surface moves as before, except that `ground` and `front` move the whole. Bones get axes along the limbs
+    (`aim_bones`).
 
     Parameters
     ----------
     rig : Rig
+        The body.
     poses : (T, J, 3) float, radians
         T is 0 without a motion.
     trans : (T, 3) float, metres
+        Travel of the root's joint.
     up : int
         0, 1 or 2: the axis of the body that points up.
     root : str, optional
@@ -49,12 +51,12 @@ def for_programs(rig: Rig, poses: np.ndarray, trans: np.ndarray, up: int, root: 
 
 
 def aim_bones(rig: Rig, up: int) -> Rig:
-    """The rig with bones that point along the limbs: y of every bone to the next joint.
+    """Turn the bones' axes so that y points along the limb, to the next joint.
 
-    Where bones branch the next joint is that of the largest branch nearest the middle of the body, so that a pelvis
-    points up the spine and a chest to the head; at the end of a limb it is the end of the surface. Roll: z is as near
-    to the front as y allows, or to up where the bone itself points forwards or backwards, within 60 degrees, so that x
-    is the hinge of elbows, knees and ankles, and left and right mirror each other.
+    Where bones branch, the next joint is that of the largest branch near the middle of the body. So a pelvis points up
+    the spine and a chest to the head. At the end of a limb y points to the end of the surface. Roll: z is as near to
+    the front as y allows, or to up where the bone itself points within 60 degrees of the front or back. So x is the
+    hinge of elbows, knees and ankles, and left and right mirror each other.
     """
     vertical, ahead = stance(rig.mesh, vertical=np.eye(3)[up])
     ends, joints = part_ends(rig.skeleton, rig.mesh), rig.skeleton.joints
@@ -64,6 +66,7 @@ def aim_bones(rig: Rig, up: int) -> Rig:
         y = (ends[j] if child is None else joints[child]) - joints[j]
         length = np.linalg.norm(y)
         y = y / length if length > 1e-9 else vertical
+        # 0.5 is the cosine of 60 degrees: a foot points forwards, so its z is up
         z = ahead if abs(y @ ahead) < 0.5 else vertical
         z = z - (z @ y) * y
         z /= np.linalg.norm(z)
@@ -73,7 +76,7 @@ def aim_bones(rig: Rig, up: int) -> Rig:
 
 def place_on_ground(rig: Rig, poses: np.ndarray, trans: np.ndarray, up: int, ground: bool, front: bool
                     ) -> tuple[Rig, np.ndarray, np.ndarray]:
-    """The rig and its motion (T may be 0) on the ground and with the face to the viewer, as `for_programs` says."""
+    """Put the rig and its motion (T may be 0) on the ground and turn the face to the viewer, as in `for_programs`."""
     Q = W = np.eye(3)
     if front:
         Q = to_viewer(*stance(rig.mesh, vertical=np.eye(3)[up]), up)
@@ -86,9 +89,9 @@ def place_on_ground(rig: Rig, poses: np.ndarray, trans: np.ndarray, up: int, gro
     vertical = np.eye(3)[up]
     shift = step = -rig.mesh.vertices[:, up].min() * vertical
     if len(poses):
-        # of a motion, in which its lowest point is looked for
+        # the lowest point of the motion, in at most 200 frames spread evenly
         chosen = spread_indices(len(poses), 200)
-        # twenty bodies are held at a time
+        # twenty bodies are held in memory at a time
         step = -min(float(rig.vertices(poses[some], trans[some])[..., up].min())
                     for some in np.array_split(chosen, -(-len(chosen) // 20))) * vertical
     return transform_rig(rig, poses, trans, (np.eye(3), shift), (np.eye(3), step))
@@ -96,9 +99,10 @@ def place_on_ground(rig: Rig, poses: np.ndarray, trans: np.ndarray, up: int, gro
 
 def stand_mesh(body: Mesh, rest: Mesh, up: int | None, ground: bool, front: bool, turned: np.ndarray | None = None
                ) -> Mesh:
-    """A mesh with its lowest point at height 0, and its face to the viewer: -y where z is up, else +z.
+    """Move a mesh's lowest point to height 0 and turn its face to the viewer: -y where z is up, else +z.
 
-    What is up, without `up` (0, 1 or 2), and front is told by the same body at rest, whose root is `turned` (3, 3).
+    The same body at rest shows which way is front, and up unless `up` (0, 1 or 2) is given. Its root is rotated by
+    `turned` (3, 3) in the mesh.
     """
     up = guess_upright(rest)[0] if up is None else up
     points = body.vertices
@@ -108,17 +112,18 @@ def stand_mesh(body: Mesh, rest: Mesh, up: int | None, ground: bool, front: bool
 
 
 def to_viewer(vertical: np.ndarray, ahead: np.ndarray, up: int) -> np.ndarray:
-    """The rotation (3, 3) that turns up, and ahead, unit vectors (3,), to the axis `up` and to the viewer."""
+    """Compute the rotation (3, 3) that takes unit vectors `vertical` to the axis `up`, and `ahead` to the viewer."""
     U = turn_up(up)
     return np.stack([U[1], U[2], U[0]]).T @ np.stack([vertical, ahead, np.cross(vertical, ahead)])
 
 
 def _next(rig: Rig, j: int, across: np.ndarray) -> int | None:
-    """The joint that a bone points to, None at the end of a limb; `across` (3,) is the unit vector to the left."""
+    """Find the joint that a bone points to, None at the end of a limb; `across` (3,) is the unit vector to the left."""
     parents, joints = rig.skeleton.parents, rig.skeleton.joints
     children = np.flatnonzero(parents == j)
     if len(children) < 2:
         return int(children[0]) if len(children) else None
+    # several children: prefer those without a side in their name, then near the middle, then large ones
     size = rig.skeleton.descends[children] @ np.bincount(rig.skeleton.part_of_face, minlength=len(parents))
     aside = np.abs((joints[children] - joints[j]) @ across)
     sided = np.array([side_of(rig.skeleton.names[c]) != 0 for c in children])

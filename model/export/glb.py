@@ -19,10 +19,10 @@ from ..rig import Rig, check_motion
 
 @dataclass(frozen=True, eq=False)
 class Material:
-    """What the surface of a rig looks like, whose vertices are repeated where the chart of the images has a seam.
+    """Texture, normal map and heights of a rig whose vertices are repeated at the seams of the texture chart.
 
-    glTF has no place for heights, a displacement along the normal: they become a grey image of two bytes, which the
-    material names in its `extras` with the heights of black and of white.
+    glTF has no place for displacement maps. Heights become a grey image of 16 bits, which the material names in its
+    `extras`, with the heights of black and of white.
     """
 
     uv: np.ndarray                           # (N, 2): (0, 0) is the lower left corner of the images, (1, 1) opposite
@@ -37,31 +37,44 @@ class Material:
 
 def write_skinned_glb(path: str | Path, rig: Rig, poses: np.ndarray | None = None, trans: np.ndarray | None = None,
                       rate: float = 30.0, up: int = 2, material: Material | None = None) -> None:
-    """Write a body that hangs on joints, for any glTF 2.0 viewer, animation program or game engine.
+    """Write a skinned body for any glTF 2.0 viewer, animation program or game engine.
 
-    One node for every joint, where the joint is at rest and with the axes of the rig; morph targets `beta 1 +3`,
-    `beta 1 -3`, ... (`Rig.beta_targets`). The joints stay where they are when such a weight changes, so export a person
-    of another shape with betas of their own. The rig's correctives are further targets, which the motion drives.
-    Everything is turned so that y is up, as glTF has it.
+    Every joint is a node, at its rest position and with the axes of the rig. Morph targets are called `beta 1 +3`,
+    `beta 1 -3`, ... (`Rig.beta_targets`). They do not move the joints, so export another person with betas of their
+    own. The rig's correctives are further targets, which the motion drives. Everything is turned so that y is up.
 
     Parameters
     ----------
     path : str or Path
+        `.glb` file to write.
     rig : Rig
+        The body, see `model.rig.make_rig`.
     poses : (T, J, 3) float, radians, optional
-        A motion: rotations of all joints and places of the root.
+        A motion: poses of all frames.
     trans : (T, 3) float, metres, optional
+        Travel of the root's joint.
     rate : float, frames a second
+        Frame rate of the motion.
     up : int
         0, 1 or 2: the axis of the body that points up.
     material : Material, optional
-        Else one dull colour.
+        Textures; by default one plain colour.
 
     Raises
     ------
     ValueError
         A motion of other parts, empty, not finite or of another length than the correctives; a rate that is
         not positive; an axis that does not exist.
+
+    Examples
+    --------
+    >>> import os, tempfile
+    >>> from model import load_built_in_model
+    >>> from model.rig import make_rig
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     write_skinned_glb(f"{folder}/body.glb", make_rig(load_built_in_model()))
+    ...     os.listdir(folder)
+    ['body.glb']
     """
     data = encode_skinned_glb(rig, poses, trans, rate, up, material)
     with writing(path) as beside:
@@ -70,13 +83,14 @@ def write_skinned_glb(path: str | Path, rig: Rig, poses: np.ndarray | None = Non
 
 def encode_skinned_glb(rig: Rig, poses: np.ndarray | None = None, trans: np.ndarray | None = None, rate: float = 30.0,
                        up: int = 2, material: Material | None = None) -> bytes:
-    """The bytes of `write_skinned_glb`."""
+    """Encode what `write_skinned_glb` writes, as bytes."""
     U = turn_up(up).T
     rig, glb = rig.with_up(up), Glb()
     names, targets = rig.beta_targets()
     if rig.correctives is not None:
         names += [f"corrective {k + 1}" for k in range(len(rig.correctives.shapes))]
         targets = np.concatenate([targets, rig.correctives.shapes])
+    # morph targets of betas, then of the motion; all start at weight 0
     mesh: dict[str, Any] = {"name": "body", "primitives": [_primitive(glb, rig, targets, material, U)]}
     if names:
         mesh |= {"weights": [0] * len(names), "extras": {"targetNames": names}}
@@ -91,19 +105,19 @@ def encode_skinned_glb(rig: Rig, poses: np.ndarray | None = None, trans: np.ndar
 
 
 def four_carriers(weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The joints (N, 4) that carry each vertex most, and their weights (N, 4), which sum to 1.
+    """Find the four joints (N, 4) with the largest weights of each vertex, and these weights (N, 4).
 
-    Where fewer carry it, joint 0 stands with weight 0.
+    Vertices with fewer joints are filled up with joint 0 and weight 0.
     """
     joints = np.argsort(-weights, axis=1, kind="stable")[:, :CARRIERS]
-    kept = np.take_along_axis(weights, joints, axis=1)
-    joints[kept == 0] = 0
+    largest = np.take_along_axis(weights, joints, axis=1)
+    joints[largest == 0] = 0
     missing = CARRIERS - joints.shape[1]
-    return np.pad(joints, ((0, 0), (0, missing))), np.pad(kept, ((0, 0), (0, missing)))
+    return np.pad(joints, ((0, 0), (0, missing))), np.pad(largest, ((0, 0), (0, missing)))
 
 
 def continuous_quaternions(R: np.ndarray) -> np.ndarray:
-    """Unit quaternions (T, J, 4), scalar last, of rotations (T, J, 3, 3), without changes of sign between frames."""
+    """Convert rotations (T, J, 3, 3) to unit quaternions (T, J, 4), scalar last, without sign changes over time."""
     q = Rotation.from_matrix(R.reshape(-1, 3, 3)).as_quat().reshape(*R.shape[:2], 4)
     same = (q[1:] * q[:-1]).sum(axis=-1, keepdims=True) >= 0
     q[1:] *= np.cumprod(np.where(same, 1, -1), axis=0)
@@ -122,7 +136,7 @@ def _primitive(glb: Glb, rig: Rig, targets: np.ndarray, material: Material | Non
 
 
 def _materials(glb: Glb, material: Material | None, colored: bool) -> dict[str, Any]:
-    """The material with its images; white where the vertices are coloured."""
+    """Build the material with its images; it is white where vertices or a texture give the colour."""
     white = colored or (material is not None and material.color is not None)
     out = skin_material((1, 1, 1)) if white else skin_material()
     images: list[dict[str, Any]] = []
@@ -142,13 +156,14 @@ def _materials(glb: Glb, material: Material | None, colored: bool) -> dict[str, 
                          "displacementWhite": high, "displacementUnit": "metre"}
     if not images:
         return {"materials": [out]}
+    # glTF codes: clamp to the edge, linear filter, smaller copies for distance
     edges = {"wrapS": 33071, "wrapT": 33071, "magFilter": 9729, "minFilter": 9987}
     textures = [{"name": image["name"], "sampler": 0, "source": k} for k, image in enumerate(images)]
     return {"materials": [out], "images": images, "textures": textures, "samplers": [edges]}
 
 
 def _nodes(rig: Rig) -> list[dict[str, Any]]:
-    """The mesh, then the joints; joint j is node j + 1."""
+    """Build the nodes: the mesh first, then the joints; joint j is node j + 1."""
     J = len(rig.skeleton.parents)
     turned = _quaternions(rig, np.zeros((1, J, 3)))[0]
     nodes: list[dict[str, Any]] = [{"name": "body", "mesh": 0, "skin": 0}]
@@ -170,7 +185,7 @@ def _skin(glb: Glb, rig: Rig) -> dict[str, Any]:
 
 
 def _quaternions(rig: Rig, poses: np.ndarray) -> np.ndarray:
-    """(T, J, 4) what the nodes of the joints are turned by in poses (T, J, 3)."""
+    """Compute the quaternions (T, J, 4) of the joints' nodes in poses (T, J, 3)."""
     return continuous_quaternions(rig.local_rotations(poses))
 
 
@@ -186,6 +201,7 @@ def _animation(glb: Glb, rig: Rig, poses: np.ndarray, trans: np.ndarray, rate: f
         frames = rig.correctives.frames
         if frames[-1] >= len(poses):
             raise ValueError(f"correctives: expected weights of {len(poses)} frames, got frame {frames[-1]}")
+        # correctives may have weights in some frames only: they get times of their own
         if len(frames) < len(poses):
             times = glb.add(frames / rate, "SCALAR", None, bounds=True)
         weights = np.zeros((len(frames), targets))                            # those of the betas stay 0

@@ -1,4 +1,4 @@
-"""The names that other programs have for the parts of people."""
+"""Names of people's bones in other programs."""
 from __future__ import annotations
 
 from dataclasses import replace
@@ -11,8 +11,8 @@ from ..rig import Rig
 
 Names = Literal["mixamo", "vrm", "h-anim", "opensim"]
 
-# The trunk from the pelvis to the part with the arms, neck, head, limbs; {S} is Left or Right, {s} left or right, {l} l
-# or r. H-Anim: joints of version 2; OpenSim: bodies of the usual models of the whole body.
+# Trunk: from the pelvis to the part with the arms. Limbs: {S} is Left or Right, {s} left or right, {l} l or r.
+# H-Anim names are joints of version 2; OpenSim names are bodies of its usual full-body models.
 _TRUNK = {"mixamo": ("Hips", "Spine", "Spine1", "Spine2"), "vrm": ("hips", "spine", "chest", "upperChest"),
           "h-anim": ("sacroiliac", "vl5", "vt12", "vt5"), "opensim": ("pelvis",)}
 _LIMBS = ("sternoclavicular", "shoulder", "elbow", "wrist", "hip", "knee", "ankle")
@@ -24,10 +24,10 @@ _SIDED = {
 
 
 def names_of(skeleton: Skeleton, kind: Names) -> dict[str, str]:
-    """What another program calls the parts of a person, of those that it has a name for.
+    """Find another program's names for the parts of a person; parts without a counterpart are left out.
 
-    The trunk is named from the pelvis upwards, as many parts as there are; of a limb whose pieces are numbered those
-    that begin at hip, knee and ankle, or shoulder, elbow and wrist, have names (`find_numbered_roles`).
+    The trunk is named from the pelvis upwards. Of a limb in numbered pieces, those that begin at hip, knee and ankle,
+    or at shoulder, elbow and wrist, have names (`find_numbered_roles`).
 
     Raises
     ------
@@ -37,30 +37,30 @@ def names_of(skeleton: Skeleton, kind: Names) -> dict[str, str]:
     parts = skeleton.names
     rising = [name for name in ("trunk", "pelvis", "abdomen", *(f"abdomen{k}" for k in range(1, len(parts))), "chest")
               if name in parts]
-    found = dict(zip(rising, _TRUNK[kind], strict=False))
-    chest = {"opensim": "torso"}  # always that of the part with the arms, how many there are below it
+    names = dict(zip(rising, _TRUNK[kind], strict=False))
+    chest = {"opensim": "torso"}  # OpenSim has one trunk body: the part with the arms
     if kind in chest and rising[1:]:
-        found[rising[-1]] = chest[kind]
+        names[rising[-1]] = chest[kind]
     roles = find_numbered_roles(parts, skeleton.joints)
     neck = {"mixamo": "Neck", "vrm": "neck", "h-anim": "vc4"}
     if "neck" in parts and kind in neck:
-        found["neck"] = neck[kind]
+        names["neck"] = neck[kind]
     if "head" in parts:
         head = {"mixamo": "Head", "vrm": "head", "h-anim": "skullbase", "opensim": "head"}
-        found["head"] = head[kind]
+        names["head"] = head[kind]
     for side in ("left", "right"):
         for joint, name in zip(_LIMBS, _SIDED[kind], strict=True):
             if name and f"{side[0]}_{joint}" in roles:
-                found[parts[roles[f"{side[0]}_{joint}"]]] = name.format(S=side.title(), s=side, l=side[0])
-    if not found:
+                names[parts[roles[f"{side[0]}_{joint}"]]] = name.format(S=side.title(), s=side, l=side[0])
+    if not names:
         raise ValueError(f"names: expected a person's parts (pelvis, thigh_left, ...) for the names of {kind}, found "
                          f"{', '.join(parts[:4])}{', ...' if len(parts) > 4 else ''}; see scape prep skeleton")
     prefix = {"mixamo": "mixamorig:"}
-    return {part: prefix.get(kind, "") + name for part, name in found.items()}
+    return {part: prefix.get(kind, "") + name for part, name in names.items()}
 
 
 def rename_bones(rig: Rig, kind: Names) -> Rig:
-    """The rig with another program's names; parts that have no counterpart there keep theirs."""
-    found = names_of(rig.skeleton, kind)
-    names = tuple(found.get(name, name) for name in rig.skeleton.names)
+    """Rename the bones as another program does; parts without a counterpart keep their names."""
+    known = names_of(rig.skeleton, kind)
+    names = tuple(known.get(name, name) for name in rig.skeleton.names)
     return replace(rig, skeleton=replace(rig.skeleton, names=names))

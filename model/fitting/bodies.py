@@ -1,4 +1,4 @@
-"""One face for bodies of known and of unknown shape: unknowns in, points with derivatives out."""
+"""Common interface of bodies with known and unknown shape: unknowns in, points with derivatives out."""
 from __future__ import annotations
 
 from collections.abc import Callable
@@ -34,7 +34,7 @@ class NearPoints(Protocol):
 
 
 class FixedBody:
-    """A body of known shape; unknowns are x = (pose (3J), trans (3))."""
+    """A body of known shape; the unknowns are x = (pose (3J), trans (3))."""
 
     n_betas = 0
 
@@ -52,8 +52,7 @@ class FixedBody:
 
     @cached_property
     def known_poses(self) -> np.ndarray:
-        """(M, J, 3) radians, that the body was seen in, and for a person as many as `PEOPLE` that people take."""
-        # poses that people take, beside those a body was seen in
+        """(M, J, 3) radians: the body's training poses, and for a person 150 poses that people take."""
         people = human_poses(self.template, self.skeleton, 150, np.random.default_rng(0))
         return self.pose_examples if people is None else np.concatenate([self.pose_examples, people])
 
@@ -63,7 +62,10 @@ class FixedBody:
         return rotations.exp(self.known_poses)
 
     def joints_from_known(self, pose: np.ndarray) -> np.ndarray:
-        """(J,) radians by which each joint of a pose (J, 3) is turned from the nearest known one; 0 for the root."""
+        """Compute by how much each joint of a pose (J, 3) differs from its nearest known rotation, (J,) radians.
+
+        It is 0 for the root.
+        """
         if not len(self.known_poses):
             return np.zeros(len(pose))
         trace = np.einsum("mjab,jab->mj", self._known_rotations, rotations.exp(pose)).max(axis=0)   # 1 + 2 cos
@@ -72,12 +74,12 @@ class FixedBody:
         return away
 
     def split(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Pose (..., J, 3), trans (..., 3) and betas (..., K)."""
+        """Split unknowns (..., P) into pose (..., J, 3), trans (..., 3) and betas (..., K)."""
         n = self.n_angles
         return x[..., :n].reshape(*x.shape[:-1], -1, 3), x[..., n:n + 3], x[..., n + 3:]
 
     def join(self, pose: np.ndarray, trans: np.ndarray) -> np.ndarray:
-        """Unknowns (..., P) from pose (..., J, 3) and trans (..., 3), betas zero."""
+        """Join pose (..., J, 3) and trans (..., 3) to unknowns (..., P), with betas of zero."""
         betas = np.zeros((*trans.shape[:-1], self.n_betas))
         return np.concatenate([pose.reshape(*pose.shape[:-2], -1), trans, betas], axis=-1)
 
@@ -86,11 +88,11 @@ class FixedBody:
         return self
 
     def some(self, ids: np.ndarray) -> FixedBody:
-        """The body of which there are only these vertices (L,): places and points are of them, by number."""
+        """Restrict the body to these vertices (L,), which are numbered anew from 0."""
         return self._of(replace(self.subject, operator=self.subject.points(ids)))
 
     def _of(self, subject: Subject) -> FixedBody:
-        """The body of a subject in the same poses."""
+        """Build the body of another subject with the same known poses."""
         out = FixedBody(subject)
         out.known_poses, out._known_rotations = self.known_poses, self._known_rotations
         return out
@@ -105,7 +107,7 @@ class FixedBody:
         return self.subject.vertices(pose, trans).astype(np.float64)
 
     def follow(self, vertex_ids: np.ndarray, x: np.ndarray, weights: np.ndarray | None = None) -> Follow:
-        """Surface points as a function of the unknowns (B, P), valid near x (P,)."""
+        """Build surface points as a function of the unknowns (B, P), valid near x (P,)."""
         operator = self.subject.points(vertex_ids, weights)
 
         def move(x: np.ndarray) -> MovingPoints:
@@ -115,7 +117,7 @@ class FixedBody:
         return move
 
     def near(self, vertex_ids: np.ndarray, x: np.ndarray) -> NearPoints:
-        """As `follow`, for one body at a time."""
+        """Build surface points as `follow` does, for one body at a time."""
         every = np.array_equal(vertex_ids, np.arange(self.subject.n_vertices))
         return PosedPoints(self._every if every else self.subject.points(vertex_ids))
 
@@ -125,9 +127,9 @@ class FixedBody:
         return self.subject.operator.astype(np.float64)
 
     def gather(self, vertex_ids: np.ndarray, x: np.ndarray) -> tuple[NearPoints, np.ndarray]:
-        """Points near x (P,) among which vertices (L,) are, some of them repeated, and the number of each (L,).
+        """Build points near x (P,) that include vertices (L,), which may repeat; return them and the number of each.
 
-        Where they are most of the body's vertices, all of these: to choose some takes longer than to move the others.
+        Beyond half of the body's vertices all are taken, since choosing takes longer than moving the others.
         """
         used, at = np.unique(vertex_ids, return_inverse=True)
         count = self.subject.n_vertices
@@ -135,14 +137,14 @@ class FixedBody:
 
 
 class ShapedBody(FixedBody):
-    """A body of unknown shape; unknowns are x = (pose (3J), trans (3), betas (K)).
+    """A body of unknown shape; the unknowns are x = (pose (3J), trans (3), betas (K)).
 
-    Vertices are affine in betas with a matrix D that turns with the pose. Stitching D is the dear part, so it is
-    done at an anchor pose, and from there D is carried to nearby poses as bones carry skin: rigidly with its part,
-    and along with the joint it hangs on. The derivative by the pose is that of the last subject that was built. Only
-    derivatives are approximate in this way; at x itself the places are those of the model.
+    Vertices are affine in betas with a matrix D that depends on the pose. Stitching D is expensive, so it is done at an
+    anchor pose. From there bones carry D to nearby poses, rigidly with its part. The derivative by the pose is that of
+    the subject that was built last. Only derivatives are approximate; at x itself the positions are those of the model.
 
-    `turn` radians, how far a part may turn before D is stitched anew.
+    `renew` is how far the betas may move, in standard deviations, before the subject is built anew; `turn`, radians,
+    how far a part may turn before D is stitched anew.
     """
 
     def __init__(self, model: BodyModel, renew: float = 4.0, turn: float = 1.2) -> None:
@@ -188,12 +190,14 @@ class ShapedBody(FixedBody):
 
     def _carry(self, vertex_ids: np.ndarray, x: np.ndarray, weights: np.ndarray | None = None) -> CarriedPoints:
         pose, trans, betas = self.split(x)
+        # derivatives by pose and by betas are renewed only when they have become too old
         if np.linalg.norm(betas - self._at) > self.renew:
             self._at = betas.copy()
             self.subject = self.model.subject(betas)
         if self._anchor is None or self._anchor.largest_angle(pose) > self.turn:
             self._anchor = anchor_at(self.model, pose)
         operator, at = self.subject.points(vertex_ids, weights), self._at
+        # positions are exact at x: the gap corrects the linearised ones
         D, y = self._anchor.carry(vertex_ids.ravel(), pose), self.vertices(x)[vertex_ids]
         D = D.reshape(*vertex_ids.shape, *D.shape[1:])
         if weights is not None:
@@ -203,7 +207,7 @@ class ShapedBody(FixedBody):
 
 @dataclass(frozen=True, eq=False)
 class CarriedPoints:
-    """Points of an operator (L,) at betas `at` (K,), moved by D (L, 3, K) with the betas, and by a gap (L, 3)."""
+    """Points of an operator (L,) at betas `at` (K,), shifted by a gap (L, 3) and by D (L, 3, K) times other betas."""
 
     operator: PointOperator
     at: np.ndarray
@@ -229,9 +233,9 @@ class CarriedPoints:
 
 
 class RoughBody(ShapedBody):
-    """Some vertices of a body of unknown shape, for a search: betas move them as at rest, carried as bones carry skin.
+    """Some vertices of a body of unknown shape, for a search: the effect of betas at rest is carried by the bones.
 
-    It is never stitched again, and good to a centimetre or so.
+    It is never stitched again, and accurate to about a centimetre.
     """
 
     def __init__(self, whole: ShapedBody, ids: np.ndarray) -> None:
@@ -242,7 +246,7 @@ class RoughBody(ShapedBody):
         rest = anchor_at(self.model, np.zeros((len(self.skeleton.parents), 3)))
         self._rest = rest.some(ids)
         if whole._anchor is None:
-            whole._anchor = rest                     # near enough where the joints turn little
+            whole._anchor = rest                     # a good first anchor, since it is already computed
 
     def fix_shape(self, x: np.ndarray) -> FixedBody:
         betas = self.split(x)[2]
@@ -259,9 +263,9 @@ class RoughBody(ShapedBody):
 
 
 class ResizedBody(FixedBody):
-    """A body with all lengths times a factor: the lengths of a search, in metres, are those of a person.
+    """A body scaled by a factor, so that the lengths of the search, in metres, are those of a person.
 
-    Its place is that of the root's joint, which stands where it stood.
+    It is scaled about the root's joint, which stays in place.
     """
 
     def __init__(self, inner: FixedBody, factor: float) -> None:
@@ -315,16 +319,16 @@ class ResizedPoints:
 
 
 def resize(points: np.ndarray, about: np.ndarray, factor: float) -> np.ndarray:
-    """Points (L, 3) with their distances from a point (3,) times a factor."""
+    """Scale points (L, 3) about a point (3,) by a factor."""
     return about + factor * (points - about)
 
 
 @dataclass(frozen=True, eq=False)
 class Anchor:
-    """The derivative of vertices by betas at one pose, carried to other poses as bones carry skin; by `anchor_at`.
+    """The derivative of vertices by betas at one pose, carried to other poses by the bones; made by `anchor_at`.
 
-    A vertex keeps its place in the frame of its part, and the part hangs on its joint. Stitching costs a quarter of
-    a second, carrying a millisecond; with joints turned by half a radian it is off by a twentieth.
+    Each vertex keeps its derivative in the frame of its part, relative to the part's joint. Stitching takes a quarter
+    of a second, carrying a millisecond. With joints turned by half a radian the error is a twentieth.
     """
 
     skeleton: Skeleton
@@ -334,24 +338,24 @@ class Anchor:
     local: np.ndarray                # (L, 3, K), of the vertices, less that of their parts' joints
 
     def largest_angle(self, pose: np.ndarray) -> float:
-        """The largest angle by which a part is turned at a pose (J, 3), radians."""
+        """Compute the largest angle, radians, by which a part is turned from the anchor at a pose (J, 3)."""
         R = self.skeleton.part_rotations(pose)
         return float(np.linalg.norm(rotations.log(np.swapaxes(self.R, 1, 2) @ R), axis=1).max())
 
     def some(self, ids: np.ndarray) -> Anchor:
-        """That of some vertices (L,) alone."""
+        """Restrict the anchor to some vertices (L,)."""
         return replace(self, part=self.part[ids], local=self.local[ids])
 
     def carry(self, ids: np.ndarray, pose: np.ndarray) -> np.ndarray:
-        """(L, 3, K) of some vertices at a pose (J, 3)."""
+        """Compute the derivative (L, 3, K) of some vertices at a pose (J, 3)."""
         return self._carry(self.local[ids], self.part[ids], self.joints, pose)
 
     def shift_by_betas(self, pose: np.ndarray, betas: np.ndarray) -> np.ndarray:
-        """(L, 3) metres by which betas (K,) move the vertices at a pose (J, 3)."""
+        """Compute the shift (L, 3), metres, of the vertices by betas (K,) at a pose (J, 3)."""
         return self._carry((self.local @ betas)[..., None], self.part, (self.joints @ betas)[..., None], pose)[..., 0]
 
     def _carry(self, local: np.ndarray, part: np.ndarray, at_joints: np.ndarray, pose: np.ndarray) -> np.ndarray:
-        """What vertices have in the frames of their parts (L, 3, k), on that of the joints (J, 3, k), at a pose."""
+        """Carry vectors of vertices (L, 3, k) and joints (J, 3, k) to a pose, with the rotations of the parts."""
         parents = self.skeleton.parents
         turn = self.skeleton.part_rotations(pose) @ np.swapaxes(self.R, 1, 2)
         joints = at_joints.copy()
@@ -362,7 +366,7 @@ class Anchor:
 
 
 def anchor_at(model: BodyModel, pose: np.ndarray) -> Anchor:
-    """The derivative of all vertices of a model by its betas at a pose (J, 3)."""
+    """Compute the derivative of all vertices of a model by its betas at a pose (J, 3)."""
     part = model.skeleton.part_of_vertex(model.template)
     D = model.shape_jacobian(pose) if pose.any() else model.rest_shape_jacobian
     joints = (model.joint_regressor @ D.reshape(len(D), -1)).reshape(-1, *D.shape[1:])
@@ -370,7 +374,7 @@ def anchor_at(model: BodyModel, pose: np.ndarray) -> Anchor:
 
 
 def as_body(body: BodyModel | Subject) -> FixedBody:
-    """The face for a model (shape unknown) or a subject (shape known)."""
+    """Wrap a model (unknown shape) or a subject (known shape) in the common interface."""
     if isinstance(body, Subject):
         return FixedBody(body)
     if isinstance(body, BodyModel):
@@ -379,7 +383,7 @@ def as_body(body: BodyModel | Subject) -> FixedBody:
 
 
 def at_rest(model: BodyModel, betas: np.ndarray | None = None) -> Mesh:
-    """The body with betas (k,), else the mean person or character, in the pose of the template."""
+    """Compute the body with betas (k,), else the mean person or character, in the pose of the template."""
     pose = np.zeros((len(model.skeleton.parents), 3))
     mean = np.zeros(model.n_betas) if model.n_betas else None
     return model.template.with_vertices(model.vertices(pose, mean if betas is None else betas))

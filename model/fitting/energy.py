@@ -1,8 +1,7 @@
-"""Residuals of completion and animation: one energy, one function, each with its Jacobian.
+"""Residuals of completion and animation: one function for each energy, with its Jacobian.
 
-Unknowns of one body are a row `x = (pose (3J), trans (3), betas (K))`; all functions take any number of
-leading dimensions, so a batch of starts or frames is one call. A residual holds the square root of what is
-minimised: the energy is the sum of its squared values.
+The unknowns of one body are a row `x = (pose (3J), trans (3), betas (K))`. All functions take any number of leading
+dimensions, so a batch of starts or frames is one call. The energy is the sum of the squared residuals.
 """
 from __future__ import annotations
 
@@ -15,7 +14,7 @@ from scanprep.geometry.least_squares import Residual
 
 from ..priors import GaussianPrior, JointLimits
 
-GIVE = 0.1                           # radians beyond a joint's limit that cost as much as one standard deviation
+GIVE = 0.1                           # radians beyond a joint limit that cost as much as one standard deviation
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,14 +41,15 @@ def moving_points(positions: np.ndarray, d_pose: np.ndarray, d_betas: np.ndarray
 
 
 def above_skin(supports: MovingPoints, distance: np.ndarray) -> MovingPoints:
-    """Points at a distance from the skin, along a normal that moves with the body.
+    """Compute points at a distance (L,), metres, from the skin, along normals that move with the body.
 
-    `distance` (L,), metres.
+    Three supports (..., 3L, 3) span the skin below each point.
     """
     p = supports.positions.reshape(*supports.positions.shape[:-2], -1, 3, 3)
     J = supports.jacobian.reshape(*p.shape, -1)
     u, v = p[..., 1, :] - p[..., 0, :], p[..., 2, :] - p[..., 0, :]
     du, dv = J[..., 1, :, :] - J[..., 0, :, :], J[..., 2, :, :] - J[..., 0, :, :]
+    # unit normal n = c / |c|, and its derivative (I - n nᵀ) / |c| dc
     c = np.cross(u, v)
     length = np.linalg.norm(c, axis=-1)[..., None]
     n = c / length
@@ -60,14 +60,14 @@ def above_skin(supports: MovingPoints, distance: np.ndarray) -> MovingPoints:
 
 
 def rise_above_skin(supports: np.ndarray, distance: np.ndarray) -> np.ndarray:
-    """The positions (..., L, 3) of `above_skin` alone, from supports (..., 3L, 3), metres."""
+    """Compute only the positions (..., L, 3) of `above_skin`, from supports (..., 3L, 3), metres."""
     p = supports.reshape(*supports.shape[:-2], -1, 3, 3)
     c = np.cross(p[..., 1, :] - p[..., 0, :], p[..., 2, :] - p[..., 0, :])
     return p[..., 0, :] + distance[:, None] * c / np.linalg.norm(c, axis=-1, keepdims=True)
 
 
 def point_to_point(points: MovingPoints, targets: np.ndarray, weights: np.ndarray) -> Residual:
-    """Distance of points to their targets; a target that is NaN (not seen) counts nothing.
+    """Compute residuals of points from their targets; a target of NaN (not seen) does not count.
 
     `targets` (..., L, 3), metres; `weights` (..., L), factor on the squared distance.
     """
@@ -79,7 +79,7 @@ def point_to_point(points: MovingPoints, targets: np.ndarray, weights: np.ndarra
 
 
 def pose_prior_term(x: np.ndarray, prior: GaussianPrior, weight: float | np.ndarray = 1.0) -> Residual:
-    """Squared Mahalanobis distance of the pose from the training poses (the root is free).
+    """Compute residuals of the Gaussian pose prior: Mahalanobis distance from the training poses; the root is free.
 
     [SCAPE] §9
     """
@@ -92,7 +92,8 @@ def pose_prior_term(x: np.ndarray, prior: GaussianPrior, weight: float | np.ndar
 
 
 def upright_term(x: np.ndarray, of_body: np.ndarray, up: np.ndarray, sd: float) -> Residual:
-    """How far the root's axis `of_body` (3,) leans from the direction `up` (..., 3); `sd`, radians."""
+    """Compute residuals of the lean of the root's axis `of_body` (3,) from direction `up` (..., 3), in units of `sd`.
+    """
     R = rotations.exp(x[..., :3])
     axis = R @ of_body
     J = np.zeros((*axis.shape, x.shape[-1]))
@@ -101,7 +102,7 @@ def upright_term(x: np.ndarray, of_body: np.ndarray, up: np.ndarray, sd: float) 
 
 
 def joint_limits(x: np.ndarray, limits: JointLimits, weight: float = 1.0) -> Residual:
-    """How far joints are beyond their limits, with a unit cost at `GIVE`; nothing within.
+    """Compute residuals of joints beyond their limits, in units of `GIVE`; zero within.
 
     [SCAPE-patent] §0090
     """
@@ -113,7 +114,7 @@ def joint_limits(x: np.ndarray, limits: JointLimits, weight: float = 1.0) -> Res
 
 
 def shape_prior(x: np.ndarray, first: int, weight: float = 1.0) -> Residual:
-    """Squared length of the betas, which lie in x from `first` on: a unit Gaussian."""
+    """Compute residuals of the unit Gaussian shape prior; the betas stand in x from `first` on."""
     r = np.sqrt(weight) * x[..., first:]
     J = np.zeros((*r.shape, x.shape[-1]))
     J[..., first:] = np.sqrt(weight) * np.eye(x.shape[-1] - first)
@@ -121,10 +122,10 @@ def shape_prior(x: np.ndarray, first: int, weight: float = 1.0) -> Residual:
 
 
 def stay_near(x: np.ndarray, expected: np.ndarray, weights: np.ndarray) -> Residual:
-    """Weighted distance of the unknowns (..., P) from where they are expected, weights (P,).
+    """Compute residuals of the unknowns (..., P) from expected values, with weights (P,).
 
-    With the joint angles of the previous iteration as expectation this is the damping of neighbouring
-    twists, w_T |t_a - t_b|²: to first order the twists of neighbours differ by the turn of their joint.
+    With the joint angles of the previous iteration as expectation this is the paper's damping w_T |t_a - t_b|². To
+    first order the twists of neighbouring parts differ by the rotation of their joint.
 
     [SCAPE] Eq. 11
     """
@@ -133,5 +134,5 @@ def stay_near(x: np.ndarray, expected: np.ndarray, weights: np.ndarray) -> Resid
 
 
 def geman_mcclure(distance: np.ndarray, scale: float) -> np.ndarray:
-    """Weight in (0, 1] of residuals that may be outliers, a quarter at `scale`."""
+    """Compute Geman-McClure weights in (0, 1] of distances that may be outliers; a quarter at `scale`."""
     return (scale**2 / (scale**2 + distance**2))**2

@@ -1,6 +1,6 @@
-"""Where the body cannot be: in space that a camera saw through, outside its clothing, inside another part of itself.
+"""Violations of space: vertices in free space that a camera saw through, outside clothing, or inside another part.
 
-Each kind gives, for vertices (n, 3), a `Violation`: how deep they stand there, and the plane that they should reach.
+Each kind gives, for vertices (n, 3), a `Violation`: how deep they are there, and the plane that they should reach.
 """
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ from scanprep.skeleton.tree import Skeleton
 from .normals import faces, facing_point
 from .scan import ScanPoints
 
-TOLERANCE = 0.03                     # metres: the rim that scanners lose, and an inexact viewpoint
-INSIDE, PRESSED = 0.12, 0.015        # metres: half of the thickest part of a body; how deep skin may press into skin
-CELL, MARGIN, CAP = 0.05, 0.3, 0.15   # metres: of the table of what cameras must have seen; further off is as bad
-CLOTHING, NOISE = 0.10, 0.003        # metres that hair or a skirt may stand off the skin; that skin may stick out
+TOLERANCE = 0.03                     # metres: scanners lose the rim of a body, and the viewpoint is not exact
+INSIDE, PRESSED = 0.12, 0.015        # metres: half the thickest part of a body; how deep skin may press into skin
+CELL, MARGIN, CAP = 0.05, 0.3, 0.15   # metres: cell and margin of the table of free space, and its largest value
+CLOTHING, NOISE = 0.10, 0.003        # metres: how far hair or a skirt stands off the skin; noise of the scan
 
 
 class Violation(NamedTuple):
-    """Of n vertices: metres (n,) beyond what is allowed, zero where all is well; a plane to reach: normals, points."""
+    """Of n vertices: `excess` (n,), metres beyond what is allowed, and the plane to reach, `normal` and `target`."""
 
     excess: np.ndarray
     normal: np.ndarray
@@ -48,7 +48,8 @@ class CameraView:
         return depth, direction, cKDTree(direction)
 
     def violation(self, vertices: np.ndarray) -> Violation:
-        """How far vertices (n, 3) stand where the camera saw nothing, or in front of what it saw."""
+        """Compute how far vertices (n, 3) are beside what the camera saw, or in front of it."""
+        # the nearest rays, distance from the nearest one (beside), and how far in front of the surface there (ahead)
         depth, direction, tree = self._rays
         away = vertices - self.viewpoint
         far = np.linalg.norm(away, axis=1)
@@ -58,6 +59,7 @@ class CameraView:
         wide = np.linalg.norm(beside, axis=1)
         front = np.where(chord * far[:, None] < TOLERANCE, depth[near], np.inf).min(axis=1)
         ahead = np.where(np.isfinite(front), front - far, 0.0)
+        # the shorter way out: sideways to the ray, or backwards along it
         outside = wide > np.maximum(TOLERANCE, ahead)
         normal = np.where(outside[:, None], beside / np.maximum(wide, 1e-12)[:, None], -away / far[:, None])
         excess = np.maximum(np.where(outside, wide, ahead) - TOLERANCE, 0)
@@ -65,21 +67,21 @@ class CameraView:
 
 
 class PictureView:
-    """A person as a depth camera saw them: nothing is in front of what was measured, beyond the border anything."""
+    """A person in a depth picture: nothing is in front of what was measured; beyond the border nothing is known."""
 
     def __init__(self, person: PicturedPerson) -> None:
         self.picture = person.picture
         self.points, self.viewpoint = person.picture.points()[person.mask], np.zeros(3)
         known = np.isfinite(person.picture.depth)
-        # pixels that a depth camera loses at the edge of a body
+        # depth cameras lose about two pixels at the edge of a body: these are not counted as empty
         self._empty = known & ~binary_dilation(person.mask, np.ones((3, 3)), 2)
-        told = person.mask | self._empty
-        nearest = minimum_filter(np.where(told, person.picture.depth, np.inf), 3)     # an edge is good to a pixel
-        self._depth = np.where(told, nearest, 0.0)
+        measured = person.mask | self._empty
+        nearest = minimum_filter(np.where(measured, person.picture.depth, np.inf), 3)     # an edge is good to a pixel
+        self._depth = np.where(measured, nearest, 0.0)
         self._way, self._edge = distance_transform_edt(self._empty, return_indices=True)
 
     def violation(self, vertices: np.ndarray) -> Violation:
-        """How far vertices (n, 3) stand beside the person, or in front of what was seen."""
+        """Compute how far vertices (n, 3) are beside the person, or in front of what was seen."""
         row, column, inside = self.picture.project(vertices)
         z = vertices[:, 2]
         ahead = np.where(inside, self._depth[row, column] - z, 0.0)
@@ -94,16 +96,16 @@ class PictureView:
 
 
 def free_space_violation(cameras: Sequence[CameraView | PictureView], vertices: np.ndarray) -> Violation:
-    """That of the camera, at least one, that objects most to each of the vertices (n, 3)."""
-    found = [camera.violation(vertices) for camera in cameras]
-    if len(found) == 1:
-        return found[0]
-    worst, each = np.argmax([one.excess for one in found], axis=0), np.arange(len(vertices))
-    return Violation(*(np.stack(part)[worst, each] for part in zip(*found, strict=True)))
+    """Compute the largest free-space violation over cameras, at least one, for each of the vertices (n, 3)."""
+    by_camera = [camera.violation(vertices) for camera in cameras]
+    if len(by_camera) == 1:
+        return by_camera[0]
+    worst, each = np.argmax([one.excess for one in by_camera], axis=0), np.arange(len(vertices))
+    return Violation(*(np.stack(part)[worst, each] for part in zip(*by_camera, strict=True)))
 
 
 class Outside:
-    """A table of how far places stand where cameras, at least one, would have seen them."""
+    """A table of free-space violations over the space around a scan, for at least one camera."""
 
     def __init__(self, cameras: Sequence[CameraView | PictureView]) -> None:
         points = np.concatenate([camera.points for camera in cameras])
@@ -114,38 +116,38 @@ class Outside:
         self.excess = np.minimum(excess, CAP).astype(np.float32)
 
     def at(self, places: np.ndarray) -> np.ndarray:
-        """(...) metres, for places (..., 3); beyond the table as at its end."""
+        """Look up violations (...), metres, of points (..., 3); beyond the table the value at its edge."""
         cell = ((places - self.low.astype(places.dtype)) / CELL).astype(np.int32)
         x, y, z = (np.clip(cell[..., axis], 0, count - 1) for axis, count in enumerate(self.count.tolist()))
         return self.excess[(x * int(self.count[1]) + y) * int(self.count[2]) + z]
 
 
 def find_cameras(cloud: ScanPoints) -> tuple[CameraView | PictureView, ...]:
-    """The cameras of those views that have a viewpoint, given or found; what is masked was seen too."""
+    """Find the cameras of the views that have a viewpoint, given or estimated; masked points were seen too."""
     if cloud.person is not None:
         return (PictureView(cloud.person),)
     seen = cloud.everything
     views = [seen.some(seen.view == number) for number in range(cloud.views)]
-    given: Sequence[np.ndarray | None] = len(views) * (None,) if cloud.viewpoints is None else list(cloud.viewpoints)
-    found = [find_camera(view, place) for view, place in zip(views, given, strict=True) if len(view.points)]
-    return tuple(camera for camera in found if camera is not None)
+    places: Sequence[np.ndarray | None] = len(views) * (None,) if cloud.viewpoints is None else list(cloud.viewpoints)
+    cameras = [find_camera(view, place) for view, place in zip(views, places, strict=True) if len(view.points)]
+    return tuple(camera for camera in cameras if camera is not None)
 
 
 def find_camera(cloud: ScanPoints, viewpoint: np.ndarray | None = None) -> CameraView | None:
-    """The camera of a scan, or None when no single viewpoint faces nearly all of it.
+    """Find the camera of a scan; None where no single viewpoint faces nearly all of it.
 
-    Where it is not known, it is the one that the fewest normals turn away from; its direction is good to a few
-    degrees, its distance is not.
+    An unknown viewpoint is estimated as the one from which the fewest normals turn away. Its direction is good to a few
+    degrees; its distance is not reliable.
     """
     if viewpoint is None:
         viewpoint = facing_point(cloud.points, cloud.normals)
     facing = faces(viewpoint, cloud.points, cloud.normals)
-    # share of the points of a scan that must face its one viewpoint
+    # 97% of the points must face the viewpoint; normals are never all right
     return CameraView(np.asarray(viewpoint, dtype=np.float64), cloud.points) if facing.mean() >= 0.97 else None
 
 
 class Contact:
-    """Some vertices of a body by the part (n,) of each: no part may enter another that is not next to it."""
+    """Self-contact of vertices, given the part (n,) of each: no part may enter another that is not its neighbour."""
 
     def __init__(self, skeleton: Skeleton, part: np.ndarray) -> None:
         apart = ~np.eye(len(skeleton.parents), dtype=bool)
@@ -156,45 +158,47 @@ class Contact:
         self._mine, self._apart = np.split(self._order, self._starts[1:]), apart[np.ix_(used, used)]
 
     def violation(self, places: np.ndarray, normals: np.ndarray) -> Violation:
-        """How deep vertices (n, 3) with normals (n, 3) stand inside another part."""
+        """Compute how deep vertices (n, 3) with normals (n, 3) are inside another part."""
+        # only parts whose bounding boxes come near each other are compared
         depth, way = np.zeros(len(places)), np.zeros_like(places)
         low, high = (of.reduceat(places[self._order], self._starts) for of in (np.minimum, np.maximum))
         near = self._apart & (low[:, None] < high + INSIDE).all(axis=2) & (high[:, None] > low - INSIDE).all(axis=2)
         for p in np.flatnonzero(near.any(axis=1)):
-            mine, others = self._mine[p], np.concatenate([self._mine[q] for q in np.flatnonzero(near[p])])
+            own, others = self._mine[p], np.concatenate([self._mine[q] for q in np.flatnonzero(near[p])])
             there = places[others]
             others = others[((there > low[p] - INSIDE) & (there < high[p] + INSIDE)).all(axis=1)]
             if not len(others):
                 continue
-            far, hit = cKDTree(places[others]).query(places[mine], distance_upper_bound=INSIDE)
-            found = np.isfinite(far)
-            mine, hit = mine[found], others[hit[found]]
-            inside = np.einsum("nd,nd->n", normals[hit], places[hit] - places[mine]) - PRESSED
-            depth[mine], way[mine] = np.maximum(inside, 0), normals[hit]
+            far, hit = cKDTree(places[others]).query(places[own], distance_upper_bound=INSIDE)
+            close = np.isfinite(far)
+            own, hit = own[close], others[hit[close]]
+            # depth behind the tangent plane of the nearest vertex of the other parts
+            inside = np.einsum("nd,nd->n", normals[hit], places[hit] - places[own]) - PRESSED
+            depth[own], way[own] = np.maximum(inside, 0), normals[hit]
         return Violation(depth, way, places + depth[:, None] * way)
 
 
 class Clothing:
-    """Points of clothing and hair: the body is inside them."""
+    """Points of clothing and hair, which enclose the body."""
 
     def __init__(self, scan: ScanPoints) -> None:
         self.scan = scan
         self._near = OrientedPoints(scan.points, scan.normals)
 
     def violation(self, places: np.ndarray, normals: np.ndarray) -> Violation:
-        """How far vertices (n, 3) with normals (n, 3) stick out; zero inside, and where no clothing is."""
+        """Compute how far vertices (n, 3) with normals (n, 3) stick out; zero inside and where there is no clothing."""
         over, out, near = self._over(places, normals)
         depth = np.where(over, np.maximum(out - NOISE, 0), 0.0)
         normal = self.scan.normals[near]
         return Violation(depth, normal, places - depth[:, None] * normal)
 
     def below(self, places: np.ndarray, normals: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Which vertices (n,) are under it, and the point (n, 3) and normal (n, 3) of what lies over each."""
+        """Find vertices (n,) under clothing, with the point (n, 3) and normal (n, 3) of the clothing over each."""
         over, out, near = self._over(places, normals)
         return over & (out < 0), self.scan.points[near], self.scan.normals[near]
 
     def _over(self, places: np.ndarray, normals: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Whether something lies over a vertex or under it, how far the vertex is outside, and which point it is."""
+        """Match vertices to clothing: whether there is any, how far the vertex is outside, and the point's number."""
         found = self._near.match(places, normals, CLOTHING, 0.3)
         off = places - self.scan.points[found.index]
         out = np.einsum("nd,nd->n", off, self.scan.normals[found.index])

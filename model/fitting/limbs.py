@@ -1,4 +1,4 @@
-"""Limbs in the wrong place begin again from draws, where that explains the scan better."""
+"""Re-initialisation of misplaced limbs from random poses, where that explains the scan better."""
 from __future__ import annotations
 
 from dataclasses import dataclass
@@ -16,52 +16,53 @@ from .scan import spread_points
 from .scan_fit import EVIDENCE, ScanFit
 from .starts import approach
 
-REACHES = (0.2, 0.15, 0.1)           # metres, of the rounds after a limb was moved
-SKIN, SCAN = 80, 120                 # vertices of a limb and points of the scan that a draw is judged by
-CAP = 0.1                            # metres: further off is as bad
-CAPS, NOISES = (0.4, 0.25, 0.15, 0.1), (0.4, 0.25, 0.15, 0.1)   # metres, and radians, of draws around the best
-CELL = 0.03                          # metres: of the table of the inside of a body
-EXPLAINED = 0.04                     # metres of the body within which a point of the scan needs no limb
-FOLLOWED, APART = 4, 0.1             # draws that are followed, and by how many metres they differ at the limb's end
-AMISS = 30.0                         # energy of what is wrong with a limb from which on it is sought
-BETTER, SHARE = 5.0, 0.01            # by how much, and what share of it, the misfit must fall for a limb to be moved
-ROUNDS = 2                           # times that all limbs that are amiss are gone through
+REACHES = (0.2, 0.15, 0.1)           # metres: largest match distance in the rounds after a limb was moved
+SKIN, SCAN = 80, 120                 # vertices of a limb and points of the scan by which a random pose is judged
+CAP = 0.1                            # metres: largest violation that counts; more is as bad
+CAPS, NOISES = (0.4, 0.25, 0.15, 0.1), (0.4, 0.25, 0.15, 0.1)   # metres and radians: caps and noise of finer rounds
+CELL = 0.03                          # metres: cell of the table of the inside of a body
+EXPLAINED = 0.04                     # metres: scan points this near to the rest of the body need no limb
+FOLLOWED, APART = 4, 0.1             # random poses that are refined, and metres by which they differ at the limb's end
+AMISS = 30.0                         # energy from which on a limb counts as misplaced
+BETTER, SHARE = 5.0, 0.01            # the misfit must fall by this, and by this share of it, for a limb to be moved
+ROUNDS = 2                           # how often every limb may be tried
 
 
-def with_limbs(fit: ScanFit, few: ScanFit, starts: np.ndarray) -> tuple[np.ndarray, np.ndarray | None]:
-    """Unknowns (P,) of the best of starts (n, P), best first, when limbs were moved to where they explain the scan.
+def with_limbs(fit: ScanFit, coarse: ScanFit, starts: np.ndarray) -> tuple[np.ndarray, np.ndarray | None]:
+    """Find the best of starts (n, P), best first, after misplaced limbs were re-initialised: unknowns (P,).
 
-    Those after the first have their turn while something grave is amiss: a body that faces the wrong way keeps limbs
-    that explain nothing wherever they are moved. In clothes front and back are so much alike that without landmarks
-    the second is always tried. Returns also another body (P,) that explains the scan nearly as well; None without one.
+    Starts after the first are tried only while limbs are badly misplaced. In a body that faces the wrong way, limbs
+    explain nothing wherever they are moved. Without landmarks the second start is always tried on a depth picture,
+    where front and back in clothes look alike. Also returns another body (P,) that explains the scan nearly as well, or
+    None.
     """
-    ends = [reinitialise_limbs(few, starts[0])]
+    ends = [reinitialise_limbs(coarse, starts[0])]
     for x in starts[1:]:
         both = len(ends) == 1 and fit.cloud.person is not None and not len(fit.vertices)
-        # energy from which on the whole body may be wrong
-        if not both and not misplaced_limbs(few, min(ends, key=few.misfit), 100.0):
+        # an energy of 100, three times that of a misplaced limb: the whole body may be wrong
+        if not both and not misplaced_limbs(coarse, min(ends, key=coarse.misfit), 100.0):
             break
-        ends.append(reinitialise_limbs(few, x))
+        ends.append(reinitialise_limbs(coarse, x))
     if len(ends) == 1:
         return ends[0], None
     misfits = np.array([fit.misfit(x) for x in ends])
     first, *others = np.argsort(misfits)
-    # times the least misfit that of another body may have to be nearly as good
+    # another body whose misfit is up to 1.1 times the smallest is nearly as good
     rival = next((ends[i] for i in others if misfits[i] < 1.1 * misfits[first]), None)
     return ends[first], rival
 
 
 def reinitialise_limbs(fit: ScanFit, x: np.ndarray) -> np.ndarray:
-    """Unknowns (P,) with limbs moved elsewhere where that explains the scan better; the shape is held.
+    """Re-initialise misplaced limbs where that explains the scan better; return unknowns (P,). The shape is held.
 
-    The worst has its turn first. Once one was moved the others are looked at anew: what they could have explained may
-    be explained, and what stood in their way gone.
+    The worst limb comes first. After a limb was moved the others are judged again, since it may now explain points that
+    they could have explained.
     """
     if not misplaced_limbs(fit, x):
         return x
     free, held = fit.body.n_angles + 3, fit.fix_shape(x)
     moved = approach(held, x[:free], REACHES)
-    tried: list[list[int]] = []                      # as the body is now
+    tried: list[list[int]] = []                      # limbs that were tried without success on the present body
     for _ in range(ROUNDS * len(limb_runs(fit.body.skeleton))):
         limb = next((limb for limb in misplaced_limbs(held, moved) if limb not in tried), None)
         if limb is None:
@@ -72,38 +73,41 @@ def reinitialise_limbs(fit: ScanFit, x: np.ndarray) -> np.ndarray:
 
 
 def misplaced_limbs(fit: ScanFit, x: np.ndarray, least: float = AMISS) -> list[list[int]]:
-    """The limbs, runs of parts, that stand where nothing can be or could explain what nothing does; worst first."""
+    """List misplaced limbs, worst first; a limb is a list of parts.
+
+    Misplaced limbs violate space, or could explain scan points that nothing explains.
+    """
     wrong = np.zeros(len(fit.ids))
     for weight, ids, found in fit.objections(fit.skin(x)):
         wrong[ids] += weight * np.minimum(found.excess, CAP)**2 / len(ids)
     lost, strange = fit.thin.points[fit.find_unexplained(x, fit.thin)], fit.strange(x)
-    found_amiss = {tuple(limb): misplacement(fit, x, limb, wrong, lost) + float(strange[limb].sum())
+    misplacements = {tuple(limb): misplacement(fit, x, limb, wrong, lost) + float(strange[limb].sum())
                    for limb in limb_runs(fit.body.skeleton)}
-    return [list(limb) for limb in sorted(found_amiss, key=lambda limb: -found_amiss[limb])
-            if found_amiss[limb] > least]
+    return [list(limb) for limb in sorted(misplacements, key=lambda limb: -misplacements[limb])
+            if misplacements[limb] > least]
 
 
 def misplacement(fit: ScanFit, x: np.ndarray, limb: list[int], wrong: np.ndarray, lost: np.ndarray) -> float:
-    """Energy of what is wrong with a limb, and of what it could explain.
+    """Compute the energy of a limb's violations and of unexplained scan points within its reach.
 
-    `wrong` (n,), of each vertex; `lost` (m, 3), metres, points of the scan with nothing near.
+    `wrong` (n,) are violations of each vertex; `lost` (m, 3), metres, scan points with nothing near.
     """
-    template, skeleton, mine = fit.body.template, fit.body.skeleton, np.isin(fit.part, limb)
-    joint = skeleton.joints[limb[0]]                  # of the template, to know how far the limb reaches
-    reach = np.linalg.norm(template.vertices[fit.ids[mine]] - joint, axis=1).max() + CAP
+    template, skeleton, own = fit.body.template, fit.body.skeleton, np.isin(fit.part, limb)
+    joint = skeleton.joints[limb[0]]                  # how far the limb reaches is measured on the template
+    reach = np.linalg.norm(template.vertices[fit.ids[own]] - joint, axis=1).max() + CAP
     ring = np.searchsorted(fit.ids, skeleton.ring(template, limb[0]))
     near = np.linalg.norm(lost - fit.skin(x).places[ring].mean(axis=0), axis=1) < reach
     share = EXPLAINED**2 * near.sum() / len(fit.thin.points)
-    return float(EVIDENCE / fit.config.scan_sd**2 * (wrong[mine].sum() + share))
+    return float(EVIDENCE / fit.config.scan_sd**2 * (wrong[own].sum() + share))
 
 
 def _reinitialise(fit: ScanFit, x: np.ndarray, limb: list[int]) -> np.ndarray:
-    """Unknowns (P,) with a limb as it is, or as the draw that explains most after a few rounds."""
+    """Try a limb in random poses; return unknowns (P,) with the best after a few rounds, or the limb as it was."""
     best, search = fit.misfit(x), LimbSearch.around(fit, x, limb)
-    # times as many poses of a limb are drawn as `random_starts` says
+    # 12 times `random_starts` poses are drawn, since judging one takes little time
     drawn = search.best(draws(fit, x, limb, 12 * fit.config.random_starts))
     begun = sorted((approach(fit, one, REACHES[:1]) for one in drawn), key=fit.misfit)
-    # of them, those that go on after the first round
+    # the better two go on after the first round
     for one in begun[:2]:
         tried = approach(fit, one, REACHES[1:])
         if (misfit := fit.misfit(tried)) < best - max(BETTER, SHARE * best):
@@ -112,17 +116,20 @@ def _reinitialise(fit: ScanFit, x: np.ndarray, limb: list[int]) -> np.ndarray:
 
 
 def draws(fit: ScanFit, x: np.ndarray, limb: list[int], count: int) -> np.ndarray:
-    """Poses (count, P) of a limb, from its first joint or a later one on: of the prior, and of known poses."""
+    """Draw poses (about count, P) of a limb, from the prior and from known poses.
+
+    Half of them change the whole limb, others only the part beyond a later joint.
+    """
     roots, out = [j for j in limb for _ in range(3 if j == limb[0] else 1)], []
     for root in roots:
-        some = count // (2 * len(roots)) + 1
-        out += [examples_of(fit.body, x, root, some, fit.rng), redrawn(fit.body, x, root, fit.prior, some, fit.rng)]
+        each = count // (2 * len(roots)) + 1
+        out += [examples_of(fit.body, x, root, each, fit.rng), redrawn(fit.body, x, root, fit.prior, each, fit.rng)]
     return np.concatenate(out)
 
 
 @dataclass(frozen=True, eq=False)
 class LimbSearch:
-    """One limb of a body of which all else stays, judged by a few of its vertices and what the rest leaves open."""
+    """The search for the pose of one limb; the rest of the body is held and explains part of the scan."""
 
     fit: ScanFit
     limb: list[int]                  # its parts, from the body outwards
@@ -136,22 +143,22 @@ class LimbSearch:
 
     @staticmethod
     def around(fit: ScanFit, x: np.ndarray, limb: list[int]) -> LimbSearch:
-        """The search for a limb of unknowns (P,)."""
-        skin, mine = fit.skin(x), np.isin(fit.part, limb)
-        ids = np.flatnonzero(mine)
+        """Prepare the search for a limb of unknowns (P,)."""
+        skin, own = fit.skin(x), np.isin(fit.part, limb)
+        ids = np.flatnonzero(own)
         ids = ids[spread_points(fit.body.template.vertices[fit.ids[ids]], SKIN)]
-        away = cKDTree(skin.places[~mine]).query(fit.coarse.points)[0] > EXPLAINED
+        away = cKDTree(skin.places[~own]).query(fit.coarse.points)[0] > EXPLAINED
         return LimbSearch(fit, limb, ids, np.flatnonzero(fit.part[ids] == limb[-1]), fit.part[ids] != limb[0],
                           fit.coarse.some(away).thin(SCAN).points, float(away.mean()),
-                          InsideBody.of(skin.places[~mine], skin.normals[~mine]), fit.data.outside)
+                          InsideBody.of(skin.places[~own], skin.normals[~own]), fit.data.outside)
 
     def best(self, drawn: np.ndarray) -> np.ndarray:
-        """Those few of unknowns (n, P) that explain most and differ, each after draws closer and closer around it."""
+        """Find the best distinct poses among unknowns (n, P), refined by random poses closer and closer to them."""
         angles = (3 * np.array(self.limb)[:, None] + np.arange(3)).ravel()
         for cap, noise in zip(CAPS, NOISES, strict=True):
             places, cost = self.evaluate(drawn, cap)
             order = np.argsort(cost)
-            # draws around which the next are made
+            # the 24 best distinct poses stay; the next random poses are drawn around them
             kept = drawn[order[distinct_bodies(places[order][:, self.end], 24, noise / 4)]]
             near = np.repeat(kept, len(drawn) // len(kept), axis=0)
             near[:, angles] += self.fit.rng.normal(0, noise, (len(near), len(angles)))
@@ -161,14 +168,15 @@ class LimbSearch:
         return drawn[order[distinct_bodies(places[order][:, self.end], FOLLOWED, APART)]]
 
     def evaluate(self, drawn: np.ndarray, cap: float) -> tuple[np.ndarray, np.ndarray]:
-        """Places (n, L, 3), metres, of the limb's vertices for unknowns (n, P), and energies (n,) up to a constant.
+        """Compute the limb's vertices (n, L, 3), metres, for unknowns (n, P), and energies (n,) up to a constant.
 
-        What is off by more than `cap`, metres, is as bad.
+        Distances above `cap`, metres, count as `cap`.
         """
         fit, config = self.fit, self.fit.config
         pose, trans, _ = fit.body.split(drawn)
         places = fit.body.subject.points(self.ids).evaluate(pose, trans)
         share = np.isin(fit.part[fit.sample.spread], fit.part[self.ids]).mean()
+        # inside the rest of the body, in free space, off the scan points that it should explain; and the prior
         depth = self.rest.depth(places) * self.loose
         cost = config.contact_weight * share * (np.minimum(depth, cap)**2).mean(axis=1)
         if self.free is not None:
@@ -180,7 +188,10 @@ class LimbSearch:
 
 
 def nearest_squared(places: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """(n, m) square metres from points (m, 3) to the nearest of the places (L, 3) of each of n, within a millimetre."""
+    """Compute squared distances (n, m) of points (m, 3) to the nearest of L vertices in n poses (n, L, 3).
+
+    In single precision: accurate to a millimetre.
+    """
     middle = points.mean(axis=0)
     to, out = (points - middle).astype(np.float32).T, np.empty((len(places), len(points)), dtype=np.float32)
     for i, one in enumerate((places - middle).astype(np.float32)):
@@ -191,14 +202,14 @@ def nearest_squared(places: np.ndarray, points: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True, eq=False)
 class InsideBody:
-    """A table of how deep places are inside some of a body."""
+    """A table of how deep points are inside part of a body."""
 
     low: np.ndarray                  # (3,), metres
     deep: np.ndarray                 # (a, b, c), metres
 
     @staticmethod
     def of(vertices: np.ndarray, normals: np.ndarray) -> InsideBody:
-        """The table for vertices (n, 3), metres, with their normals (n, 3)."""
+        """Build the table for vertices (n, 3), metres, with their normals (n, 3)."""
         low = vertices.min(axis=0)
         axes = [np.arange(a, b + CELL, CELL) for a, b in zip(low, vertices.max(axis=0), strict=True)]
         grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
@@ -209,7 +220,7 @@ class InsideBody:
         return InsideBody(low, np.maximum(deep - PRESSED, 0).reshape(grid.shape[:3]))
 
     def depth(self, places: np.ndarray) -> np.ndarray:
-        """(...) metres, of places (..., 3)."""
+        """Look up the depth (...), metres, of points (..., 3)."""
         cell = np.rint((places - self.low) / CELL).astype(np.int64)
         within = ((cell >= 0) & (cell < self.deep.shape)).all(axis=-1)
         cell = np.where(within[..., None], cell, 0)
@@ -217,7 +228,7 @@ class InsideBody:
 
 
 def runs_without_branch(parents: np.ndarray) -> list[list[int]]:
-    """The limbs of a tree of parts: longest runs without a branch, the root in none."""
+    """Split a tree of parts into its longest runs without a branch; the root is in none."""
     children = [np.flatnonzero(np.asarray(parents) == j) for j in range(len(parents))]
     runs = []
     for j in range(1, len(parents)):
@@ -231,29 +242,30 @@ def runs_without_branch(parents: np.ndarray) -> list[list[int]]:
 
 
 def limb_runs(skeleton: Skeleton) -> list[list[int]]:
-    """Runs of parts without a branch that end in a part from which nothing hangs, the largest first."""
+    """List the limbs: runs of parts without a branch that end in a leaf, the longest first."""
     parents = skeleton.parents
     return sorted((run for run in runs_without_branch(parents) if run[-1] not in parents), key=len, reverse=True)
 
 
 def examples_of(body: FixedBody, x: np.ndarray, root: int, count: int, rng: np.random.Generator) -> np.ndarray:
-    """Draws (count or none, P) of the limb at a joint: as it is in known poses, loosened a little."""
+    """Draw poses (count or 0, P) of the limb at a joint from known poses, with some noise."""
     known = body.known_poses.reshape(-1, body.n_angles)
     drawn = np.repeat(x[None], count if len(known) else 0, axis=0)
     if len(drawn):
         parts = np.flatnonzero(body.skeleton.descends[:, root])
         angles = (3 * parts[:, None] + np.arange(3)).ravel()
         drawn[:, angles] = known[np.arange(count) * max(1, len(known) // count) % len(known)][:, angles]
-        # radians around the limb of a known pose
+        # noise of 0.1 rad: known poses are few
         drawn[:, angles] += rng.normal(0, 0.1, (count, len(angles)))
     return drawn
 
 
 def redrawn(body: FixedBody, x: np.ndarray, root: int, prior: GaussianPrior, count: int,
             rng: np.random.Generator) -> np.ndarray:
-    """Draws (count, P) of the limb at a joint from the prior, given the other joints of x (P,)."""
+    """Draw poses (count, P) of the limb at a joint from the prior, given the other joints of x (P,)."""
     parts = np.flatnonzero(body.skeleton.descends[:, root])
     angles = (3 * parts[:, None] + np.arange(3)).ravel()
+    # conditional Gaussian: precision Λ_aa, mean μ_a - Λ_aa⁻¹ Λ_ab (x_b - μ_b)
     precision = prior.whitening.T @ prior.whitening
     others = np.setdiff1d(np.arange(body.n_angles), angles)
     block = precision[np.ix_(angles, angles)]

@@ -1,4 +1,4 @@
-"""Where a search begins that has nothing but a few named points."""
+"""Initialisation of a body from a few named points (landmarks or markers)."""
 from __future__ import annotations
 
 from collections.abc import Callable
@@ -16,15 +16,16 @@ from .bodies import FixedBody, Follow
 
 def search_bodies(body: FixedBody, follow: Follow, targets: np.ndarray, sd: float, prior: GaussianPrior, axes: int
                   ) -> tuple[np.ndarray, np.ndarray]:
-    """Likely bodies that bring points to their targets, from many starts at once.
+    """Find likely bodies that bring points to their targets, from many starts at once.
 
-    `follow` x (B, P) -> L moving points; `targets` (L, 3), metres, naN where there is none; at least 3 are needed;
-    `sd`, metres, how far a point may be from its target.
-    Returns (n, P), unknowns of every start, best first; betas stay zero; (n,), their energies.
+    `follow` maps unknowns (B, P) to L moving points. `targets` (L, 3), metres, are NaN where there is none; at least 3
+    are needed. `sd`, metres, is how far a point may be from its target. Returns the unknowns (n, P) of all starts, best
+    first, with betas of zero, and their energies (n,).
     """
     poses = typical_poses(body.pose_mean, body.pose_covariance, axes)
     x = lay_on_points(body, lambda x: follow(x).positions, poses, targets)
     weights = np.full(len(targets), sd**-2)
+    # betas are held at zero by a weight that nothing can overcome
     still = np.zeros(x.shape[1])
     still[body.n_angles + 3:] = 1e6
 
@@ -39,11 +40,11 @@ def search_bodies(body: FixedBody, follow: Follow, targets: np.ndarray, sd: floa
 
 
 def anneal(solve: Callable[[np.ndarray, float], Minimum[np.ndarray]], x: np.ndarray) -> Minimum[np.ndarray]:
-    """The end of solves, each from the end of the last, first near the usual poses, then free.
+    """Solve repeatedly with a falling weight of the pose prior, each time from the last result.
 
     `solve` takes unknowns (n, P) and the weight of the pose prior.
     """
-    # weight of the pose prior: first near the usual poses, then free
+    # ten times, then three times, then exactly the prior: first near usual poses, then free
     for stiff in (10.0, 3.0, 1.0):
         end = solve(x, stiff)
         x = end.x
@@ -52,9 +53,9 @@ def anneal(solve: Callable[[np.ndarray, float], Minimum[np.ndarray]], x: np.ndar
 
 def lay_on_points(body: FixedBody, positions: Callable[[np.ndarray], np.ndarray], poses: np.ndarray, targets: np.ndarray
                   ) -> np.ndarray:
-    """Unknowns (4 n, P) of poses (n, J, 3) laid on the targets, and turned by quarters about their long axis.
+    """Align poses (n, J, 3) with the targets, and turn each by quarters about the targets' long axis: (4 n, P).
 
-    `positions` of unknowns (B, P) are points (B, L, 3), whose targets (L, 3), metres, are NaN where there is none.
+    `positions` maps unknowns (B, P) to points (B, L, 3), whose targets (L, 3), metres, are NaN where there is none.
     """
     there = ~np.isnan(targets).any(axis=1)
     goal = targets[there]
@@ -70,7 +71,7 @@ def lay_on_points(body: FixedBody, positions: Callable[[np.ndarray], np.ndarray]
 
 
 def distinct_bodies(places: np.ndarray, count: int, apart: float = 0.02) -> list[int]:
-    """The first `count` of the bodies (n, L, 3) that differ from those before, by mean distance in metres."""
+    """Find the first `count` of the bodies (n, L, 3) that differ from all kept ones by a mean distance, metres."""
     kept: list[int] = []
     for i, place in enumerate(places):
         if len(kept) == count:

@@ -1,4 +1,4 @@
-"""Normals of points: estimated, completed, turned outward."""
+"""Normals of scan points: estimation, completion, outward orientation."""
 from __future__ import annotations
 
 import numpy as np
@@ -9,12 +9,13 @@ from scipy.spatial import cKDTree
 from scanprep.geometry.sparse import spanning_tree
 from scanprep.threads import search_threads
 
-COARSE = 2000                        # points that show the form at large
-GRAZING = 0.3                        # cosine below which a scanner sees little
+COARSE = 2000                        # points that show the overall form
+GRAZING = 0.3                        # cosine: a scanner sees little of surfaces more oblique than this
 
 
 def spread_points(points: np.ndarray, count: int) -> np.ndarray:
-    """Indices of about `count` points, one to each cell of a grid, so that they cover the whole evenly."""
+    """Choose about `count` points, one in each cell of a grid, so that they cover the whole evenly; return indices."""
+    # find the cell size by bisection, with a guess from the last count
     extent = np.ptp(points, axis=0).max()
     low, high = extent / 2048, extent
     cell = np.sqrt(low * high)
@@ -30,14 +31,14 @@ def spread_points(points: np.ndarray, count: int) -> np.ndarray:
 
 
 def plane_normals(points: np.ndarray, near: np.ndarray) -> np.ndarray:
-    """Unit normals (n, 3), of either sign, of the planes through the neighbours of each point."""
+    """Estimate unit normals (n, 3), of either sign, by the plane through the neighbours of each point."""
     around = points[near] - points[near].mean(axis=1, keepdims=True)
     _, axes = np.linalg.eigh(np.swapaxes(around, 1, 2) @ around)
     return axes[:, :, 0]
 
 
 def complete_normals(given: np.ndarray, points: np.ndarray, near: np.ndarray) -> np.ndarray:
-    """Unit normals (n, 3): those given, and where one is zero or not finite that of the neighbours' plane."""
+    """Complete normals (n, 3): where one is zero or not finite, take that of the neighbours' plane."""
     length = np.linalg.norm(given, axis=1)
     good = np.isfinite(length) & (length > 1e-9)
     normals = np.where(good[:, None], given / np.where(good, length, 1)[:, None], 0.0)
@@ -49,21 +50,22 @@ def complete_normals(given: np.ndarray, points: np.ndarray, near: np.ndarray) ->
 
 
 def one_sign(normals: np.ndarray, near: np.ndarray) -> bool:
-    """Whether given normals were oriented: many programs estimate them and leave their sign to chance."""
-    # share of neighbours that must agree for given normals to be of one sign
+    """Return whether normals are oriented consistently: many programs estimate them with random signs."""
+    # 95% of neighbours must agree; sharp edges and noise make a few disagree
     return float((np.einsum("nd,nd->n", normals, normals[near[:, 1]]) > 0).mean()) > 0.95
 
 
 def turn_outward(points: np.ndarray, normals: np.ndarray, near: np.ndarray, distance: np.ndarray, reach: float
                   ) -> np.ndarray:
-    """Normals of one sign along each connected patch, then each patch turned to its convex side.
+    """Orient normals: consistently along each connected patch, then each patch to its convex side.
 
-    Where nearly all then face one viewpoint, the scan is from there, and patches that turn away have the wrong sign.
+    Where nearly all then face one viewpoint, the scan was taken from there, and patches that turn away are flipped.
     """
     n = len(points)
     a, b = np.repeat(np.arange(n), near.shape[1] - 1), near[:, 1:].ravel()
     kept = distance[:, 1:].ravel() <= reach
     a, b = a[kept], b[kept]
+    # 1. signs spread along a spanning tree that avoids sharp edges
     turn = 1.001 - np.abs(np.einsum("nd,nd->n", normals[a], normals[b]))
     tree = spanning_tree(a, b, turn, n)
     tree = tree + tree.T
@@ -71,23 +73,23 @@ def turn_outward(points: np.ndarray, normals: np.ndarray, near: np.ndarray, dist
     roots, flipped = np.unique(patch, return_index=True)[1], np.zeros(n, dtype=bool).tolist()
     for root in roots:
         order, before = breadth_first_order(tree, root, directed=False)
-        mine, above = order[1:], before[order[1:]]
-        turned = np.einsum("nd,nd->n", normals[mine], normals[above]) < 0
-        for i, parent, turn_it in zip(mine.tolist(), above.tolist(), turned.tolist(), strict=True):
+        child, above = order[1:], before[order[1:]]
+        turned = np.einsum("nd,nd->n", normals[child], normals[above]) < 0
+        for i, parent, turn_it in zip(child.tolist(), above.tolist(), turned.tolist(), strict=True):
             flipped[i] = flipped[parent] != turn_it
     out = np.where(np.array(flipped)[:, None], -normals, normals)
+    # 2. the side on which a patch bulges, by neighbours within 12 cm of every fourth point: at that scale bodies are
+    # convex enough to tell inside from outside
     coarse = points[spread_points(points, COARSE)] if n > COARSE else points
-    # one of so many points is asked which way its patch bulges
-    some = np.r_[roots, 0:n:4]
-    # metres: at this scale a body is convex enough to tell in from out
-    far, around = cKDTree(coarse).query(points[some], 48, distance_upper_bound=0.12, workers=search_threads(len(some)))
+    at = np.r_[roots, 0:n:4]
+    far, around = cKDTree(coarse).query(points[at], 48, distance_upper_bound=0.12, workers=search_threads(len(at)))
     found = np.isfinite(far)
-    total = np.where(found[:, :, None], coarse[np.where(found, around, 0)] - points[some, None], 0).sum(axis=1)
-    bulge = -np.einsum("nd,nd->n", out[some], total)
-    sign = np.where(np.bincount(patch[some], bulge, patches) < 0, -1.0, 1.0)
+    total = np.where(found[:, :, None], coarse[np.where(found, around, 0)] - points[at, None], 0).sum(axis=1)
+    bulge = -np.einsum("nd,nd->n", out[at], total)
+    sign = np.where(np.bincount(patch[at], bulge, patches) < 0, -1.0, 1.0)
     out = out * sign[patch][:, None]
+    # 3. a scan from one viewpoint, which 90% of the points face: all patches face it
     facing = faces(facing_point(points, out), points, out)
-    # share of the points that face one viewpoint, of a scan from there
     if facing.mean() < 0.9:
         return out
     sign = np.where(np.bincount(patch, facing - 0.5, patches) < 0, -1.0, 1.0)
@@ -95,15 +97,15 @@ def turn_outward(points: np.ndarray, normals: np.ndarray, near: np.ndarray, dist
 
 
 def faces(viewpoint: np.ndarray, points: np.ndarray, normals: np.ndarray) -> np.ndarray:
-    """(n,) bool: whether normals (n, 3) of points (n, 3) face a viewpoint (3,)."""
+    """Find which normals (n, 3) of points (n, 3) face a viewpoint (3,): (n,) bool."""
     to = viewpoint - points
     return np.einsum("nd,nd->n", to, normals) > 0.05 * np.linalg.norm(to, axis=1)
 
 
 def facing_point(points: np.ndarray, normals: np.ndarray) -> np.ndarray:
-    """The viewpoint (3,) from which the fewest normals (n, 3) of points (n, 3) turn away; its distance is not exact."""
-    few = 2000  # points that are enough to find the viewpoint
-    keep = spread_points(points, few) if len(points) > few else slice(None)
+    """Estimate the viewpoint (3,) from which the fewest normals (n, 3) turn away; its distance is not exact."""
+    enough = 2000  # points determine the viewpoint as well as all do
+    keep = spread_points(points, enough) if len(points) > enough else slice(None)
     normals, centre = normals[keep], points[keep].mean(axis=0)
     points = points[keep] - centre
     size = max(np.linalg.norm(points, axis=1).max(), 1e-12)

@@ -1,4 +1,4 @@
-"""Points of a body drawn to places and to planes, and the normal equations of that: assembled when a step is wanted."""
+"""The data term of a fit: distances of body points to target points and planes, with normal equations on demand."""
 from __future__ import annotations
 
 from dataclasses import dataclass
@@ -13,13 +13,13 @@ from .bodies import NearPoints
 
 @dataclass(frozen=True, eq=False)
 class MatchTargets:
-    """`Σ a |y - t|² + b (n·(y - t))²` over matches, each of one of some points y of a body.
+    """The energy `Σ a |y - t|² + b (n·(y - t))²` over L matches of body points y with targets t and normals n.
 
     Attributes
     ----------
     points : NearPoints
     at : (L,) int
-        Which of the points each match is of; the matrix is summed over matches of the same one first.
+        The point of each match; matches of the same point are summed first.
     targets, normals : (L, 3) float, metres, and unit
     to_point, to_plane : (L,) float
         The weights a and b.
@@ -33,18 +33,22 @@ class MatchTargets:
     to_plane: np.ndarray
 
     def energies(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """What each match (L,) costs for its distance to the place, and to the plane, at unknowns (P,)."""
+        """Compute the energies (L,) of the distances to target points, and to target planes, at unknowns (P,)."""
         off, along = self._off(self.points.positions(x))
         return self.to_point * (off**2).sum(axis=1), self.to_plane * along**2
 
     def equations(self, x: np.ndarray, known: Dense) -> Deferred:
-        """At unknowns (1, P), with those of all else that is known of them."""
+        """Build the normal equations at unknowns (1, P), added to the `known` ones of priors.
+
+        The energy is computed at once; gradient and matrix only if a step is taken.
+        """
         places = self.points.positions(x[0])
         off, along = self._off(places)
         cost = known.energy + self.to_point @ (off**2).sum(axis=1) + self.to_plane @ along**2
 
         def assemble() -> Dense:
             columns, gather = self.points.columns(x[0])[1], self._gather(len(places))
+            # gradient 2 Jᵀ f and Gauss-Newton matrix 2 Jᵀ K J, both halved, with force f and stiffness K a point
             force = gather @ (self.to_point[:, None] * off + (self.to_plane * along)[:, None] * self.normals)
             rows = columns.reshape(x.shape[1], -1)
             drawn = np.einsum("pjv,ijv->piv", columns, self._stiffness(gather)).reshape(rows.shape)
@@ -53,17 +57,17 @@ class MatchTargets:
         return Deferred(cost, assemble)
 
     def _off(self, places: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """How far (L, 3) points at places (V, 3) are from their targets, and from the planes (L,), metres."""
+        """Compute the offsets (L, 3) of points (V, 3) from their targets, and their parts along the normals (L,)."""
         off = places[self.at] - self.targets
         return off, np.einsum("ld,ld->l", self.normals, off)
 
     def _gather(self, count: int) -> csr_array:
-        """(V, L) sums over the matches of each point."""
+        """Build the matrix (V, L) that sums over the matches of each point."""
         each = np.arange(len(self.at))
         return csr_array(coo_array((np.ones(len(each)), (self.at, each)), shape=(count, len(each))))
 
     def _stiffness(self, gather: csr_array) -> np.ndarray:
-        """(3, 3, V) the sum of a I + b n nᵀ over the matches of each point."""
+        """Sum a I + b n nᵀ over the matches of each point: (3, 3, V)."""
         n = self.normals
         each = self.to_point[:, None, None] * np.eye(3) + self.to_plane[:, None, None] * n[:, :, None] * n[:, None, :]
         return np.ascontiguousarray((gather @ each.reshape(-1, 9)).T).reshape(3, 3, -1)

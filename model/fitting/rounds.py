@@ -1,4 +1,4 @@
-"""Pose, place and shape together: in rounds of matching with shrinking reach, or to meet an alignment."""
+"""Joint fit of pose, place and shape: in rounds of matching with shrinking reach, or to a registered mesh."""
 from __future__ import annotations
 
 from collections.abc import Callable
@@ -14,14 +14,14 @@ from .pull import MatchTargets
 from .scan_fit import EVIDENCE, FINAL_REACH, REACH, Matched, ScanFit
 from .vertices import share_of_vertices
 
-SETTLED = 5e-4                       # metres, root mean square over the vertices from round to round
-NARROWING, SETTLING = 3, 12          # rounds from the wide to the final reach; that a reach is held at most
-CLEARLY = 0.93                       # of the narrow reach's misfit, below which the wide one's is clearly less
+SETTLED = 5e-4                       # metres: converged when vertices move less from round to round (RMS)
+NARROWING, SETTLING = 3, 12          # rounds from the wide to the final reach; most rounds at one reach
+CLEARLY = 0.93                       # the wide reach wins only with a misfit below this share of the narrow one's
 
 
 @dataclass(frozen=True, eq=False)
 class Solved:
-    """Unknowns (P,) at the end of the rounds, whether they settled, the rounds, and each term of the energy."""
+    """Result of a fit: unknowns (P,), whether it converged, the number of rounds, and each term of the energy."""
 
     x: np.ndarray
     converged: bool
@@ -30,18 +30,18 @@ class Solved:
 
 
 def solve_jointly(fit: ScanFit, few: ScanFit, x: np.ndarray, tell: Callable[[int], None]) -> Solved:
-    """All unknowns at once from x (P,) on, in rounds of matching with shrinking reach, `few` vertices first.
+    """Fit all unknowns from x (P,), in rounds of matching with shrinking reach, with `few` vertices first.
 
-    A model of many scans follows a scan closely, and matches that are farther off than it ever is are wrong. One of
-    few scans does not, and drops the limbs that it follows badly. So the rounds settle at a wide reach first, then at
-    a narrow one, and the former is kept where it explains clearly more.
+    A model of many scans follows a scan closely, so distant matches are wrong. A model of few scans does not, and at a
+    narrow reach it loses limbs that it follows badly. So the rounds converge at a wide reach first, then at a narrow
+    one. The wide result is kept only where it explains clearly more.
 
     [SCAPE] Eq. 10
     """
     wide_reach = 0.08  # metres: limit on the distance of matches, for models that follow a scan badly
     reaches = np.geomspace(REACH, wide_reach, fit.config.rounds)
     rough = _in_rounds(few, x, reaches, tell, 0)
-    # rounds at the wide reach that take all vertices, at least
+    # at least two rounds with all vertices at the wide reach, then the narrow one
     wide = _in_rounds(fit, rough.x, reaches[-1:].repeat(2), lambda i: None)
     narrow = _in_rounds(fit, wide.x, np.geomspace(wide_reach, FINAL_REACH, NARROWING), lambda i: None)
     best = wide if fit.misfit(wide.x) < CLEARLY * fit.misfit(narrow.x) else narrow
@@ -50,7 +50,7 @@ def solve_jointly(fit: ScanFit, few: ScanFit, x: np.ndarray, tell: Callable[[int
 
 def _in_rounds(fit: ScanFit, x: np.ndarray, reaches: np.ndarray, tell: Callable[[int], None],
                settling: int = SETTLING) -> Solved:
-    """Unknowns from x (P,) on when matches reach so far, metres, round by round, and the last until they settle."""
+    """Fit from x (P,) with one largest match distance, metres, a round; the last is repeated until convergence."""
     shift, place, rounds = np.inf, fit.skin(x).places, len(reaches)
     for i, reach in enumerate([*reaches, *reaches[-1:].repeat(settling)]):
         x, matched = fit.step(x, fit.thin, reach)
@@ -63,16 +63,16 @@ def _in_rounds(fit: ScanFit, x: np.ndarray, reaches: np.ndarray, tell: Callable[
 
 
 def meet_vertices(fit: ScanFit, x: np.ndarray, vertices: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    """Unknowns (P,) from x (P,) on at which a body meets an alignment, as far as priors and landmarks let it.
+    """Fit a body, from unknowns x (P,), to registered vertices, with priors and landmarks; return unknowns (P,).
 
-    `vertices` (N, 3), metres, of the alignment; `weights` (N,), from 0 for those that may be anywhere to 1.
+    `vertices` (N, 3), metres, have weights (N,) from 0, for those that may be anywhere, to 1.
     """
     ids, config = fit.sample.spread, fit.config
     share = share_of_vertices(fit.body.template.vertices, ids) / len(vertices)
     near = EVIDENCE / config.scan_sd**2 * share * weights[ids]
     to_point = np.concatenate([np.full(len(fit.vertices), config.landmark_sd**-2), near])
     targets = np.concatenate([fit.points, vertices[ids]])
-    # times that the points of a body are linearised anew to meet an alignment
+    # points are linearised anew four times
     for _ in range(4):
         points, at = fit.body.gather(np.concatenate([fit.vertices, ids]), x)
         pull = MatchTargets(points, at, targets, np.zeros_like(targets), to_point, np.zeros(len(targets)))
@@ -82,5 +82,5 @@ def meet_vertices(fit: ScanFit, x: np.ndarray, vertices: np.ndarray, weights: np
 
 
 def _equations(matched: Matched, first_beta: int, x: np.ndarray) -> Deferred:
-    """Those of matches, and of the prior of the betas, at unknowns (1, P)."""
+    """Build the equations of the matches and the shape prior at unknowns (1, P)."""
     return matched.equations(x, shape_prior(x, first_beta))

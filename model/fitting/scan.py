@@ -1,4 +1,4 @@
-"""A scan made ready for matching: points with outward normals, thinned, borders marked, what is clothing set apart."""
+"""Preparation of a scan for matching: outward normals, thinning, borders, clothing set apart."""
 from __future__ import annotations
 
 from collections.abc import Sequence
@@ -18,7 +18,7 @@ from scanprep.threads import search_threads
 
 from .normals import complete_normals, one_sign, plane_normals, spread_points, turn_outward
 
-NEIGHBOURS = 16                      # points that make one normal
+NEIGHBOURS = 16                      # points that determine one normal: enough to average out noise
 
 View = Mesh | PointCloud | np.ndarray
 Scan = View | Sequence[View] | DepthPicture
@@ -30,17 +30,17 @@ class ScanPoints:
 
     points: np.ndarray      # (n, 3), metres
     normals: np.ndarray     # (n, 3), unit, outward
-    border: np.ndarray      # (n,) bool, on the border of what the views show together; all false for bare points
+    border: np.ndarray      # (n,) bool, on the border of all views together; all false for bare points
     spacing: float          # metres, median distance of neighbouring points
     view: np.ndarray        # (n,) int, which view each point belongs to
-    index: np.ndarray       # (n,) int, its number among all points that were given, one view after the other
-    masked: ScanPoints | None = None  # the points that are clothing or hair; they are not among `points`
-    viewpoints: np.ndarray | None = None  # (views, 3), metres, where each view was seen from, when that was told
-    person: PicturedPerson | None = None      # in the picture that the points are from, where they are from one
+    index: np.ndarray       # (n,) int, number of the point among all input points, one view after the other
+    masked: ScanPoints | None = None  # points of clothing or hair, which are not among `points`
+    viewpoints: np.ndarray | None = None  # (views, 3), metres, where given
+    person: PicturedPerson | None = None      # the person in the depth picture that the points are from
 
     @property
     def views(self) -> int:
-        """How many views there are."""
+        """The number of views."""
         return 1 + max(part.view.max(initial=0) for part in (self, self.masked) if part is not None)
 
     @property
@@ -49,16 +49,16 @@ class ScanPoints:
         return self if self.masked is None else _concatenate([replace(self, masked=None), self.masked])
 
     def some(self, keep: np.ndarray) -> ScanPoints:
-        """Some of the points, by number or mask (n,); the masked ones stay."""
+        """Select some of the points, by number or mask (n,); the clothing stays."""
         return replace(self, points=self.points[keep], normals=self.normals[keep], border=self.border[keep],
                        view=self.view[keep], index=self.index[keep])
 
     def thin(self, count: int) -> ScanPoints:
-        """At most about `count` of the points, spread evenly."""
+        """Reduce the points to about `count`, spread evenly."""
         return self if len(self.points) <= count else self.some(spread_points(self.points, count))
 
     def scale_by(self, factor: float) -> ScanPoints:
-        """The scan in another unit: all lengths times a factor."""
+        """Scale all lengths by a factor."""
         masked = None if self.masked is None else self.masked.scale_by(factor)
         seen_from = None if self.viewpoints is None else factor * self.viewpoints
         assert self.person is None or factor == 1, "a picture is in metres"
@@ -68,10 +68,10 @@ class ScanPoints:
 
 def prepare_scan(scan: View | Sequence[View], viewpoint: Any = None, masked: np.ndarray | None = None,
                  metres: float = 1.0) -> ScanPoints:
-    """Points and normals of a scan.
+    """Prepare the points and normals of a scan.
 
-    `scan` Mesh, PointCloud, (n, 3) or (n, 6), metres, or a sequence of these; `viewpoint` (3,), metres, or one for
-    each view; `masked` (n,) bool, points, one view after the other, that are clothing or hair.
+    `scan` is a Mesh, PointCloud, (n, 3) or (n, 6), metres, or a sequence of these. `viewpoint` is (3,), metres, or one
+    for each view. `masked` (n,) bool marks points of clothing or hair, one view after the other.
     """
     views = [scale_view(view, metres) for view in as_views(scan)]
     from_where = check_viewpoints(viewpoint, len(views), metres)
@@ -87,9 +87,9 @@ def prepare_scan(scan: View | Sequence[View], viewpoint: Any = None, masked: np.
 
 
 def prepare_picture(picture: DepthPicture, size: float, marks: np.ndarray) -> ScanPoints:
-    """Points and normals of the one person in a picture; ValueError where there is not one.
+    """Prepare the points and normals of the one person in a depth picture; ValueError where there is not one.
 
-    `size`, metres, of the body, the root of its surface area; `marks` (L, 3), metres, points on the person.
+    `size`, metres, is the root of the body's surface area; `marks` (L, 3), metres, are points on the person.
     """
     person = segment_person(picture, size, marks)
     points, normals, edge = person.points_and_normals()
@@ -99,7 +99,7 @@ def prepare_picture(picture: DepthPicture, size: float, marks: np.ndarray) -> Sc
 
 
 def as_views(scan: View | Sequence[View]) -> list[View]:
-    """The views of a scan: a list of one for a single mesh or cloud."""
+    """List the views of a scan: one for a single mesh or cloud."""
     if isinstance(scan, Mesh | PointCloud | np.ndarray):
         return [scan]
     views = list(scan)
@@ -111,13 +111,13 @@ def as_views(scan: View | Sequence[View]) -> list[View]:
 
 
 def point_count(view: View) -> int:
-    """Points of a view, also those that belong to no triangle."""
+    """Count the points of a view, including those in no triangle."""
     return len(view.vertices) if isinstance(view, Mesh) else len(view.points) if isinstance(view, PointCloud) \
         else len(view)
 
 
 def scale_view(view: View, metres: float) -> View:
-    """A view times a factor; normals stay."""
+    """Scale a view by a factor; normals stay."""
     if metres == 1:
         return view
     if isinstance(view, Mesh):
@@ -128,12 +128,12 @@ def scale_view(view: View, metres: float) -> View:
 
 
 def all_points(scan: View | Sequence[View]) -> np.ndarray:
-    """(n, 3) the points of all views, one after the other, metres."""
+    """Concatenate the points of all views, (n, 3) metres."""
     return np.concatenate([_split(view, f"scan: view {i}")[0] for i, view in enumerate(as_views(scan))])
 
 
 def check_viewpoints(viewpoint: Any, views: int, metres: float = 1.0) -> np.ndarray | None:
-    """Viewpoints (views, 3), or None."""
+    """Check viewpoints and return them as (views, 3), metres, or None."""
     if viewpoint is None:
         return None
     given = np.asarray(viewpoint, dtype=np.float64)
@@ -144,7 +144,7 @@ def check_viewpoints(viewpoint: Any, views: int, metres: float = 1.0) -> np.ndar
 
 
 def check_mask(masked: np.ndarray, count: int) -> np.ndarray:
-    """A mask (count,) bool."""
+    """Check a mask (count,) bool; enough points must remain."""
     masked = np.asarray(masked)
     if masked.dtype != bool or masked.shape != (count,):
         raise ValueError(f"masked: expected {count} booleans, one for each point of the scan, "
@@ -156,7 +156,7 @@ def check_mask(masked: np.ndarray, count: int) -> np.ndarray:
 
 
 def _prepare_view(scan: View, viewpoint: np.ndarray | None, name: str) -> ScanPoints:
-    points, given = _split(scan, name)
+    points, own_normals = _split(scan, name)
     if len(points) <= NEIGHBOURS:
         raise ValueError(f"{name}: expected more than {NEIGHBOURS} points, got {len(points)}")
     if not np.isfinite(points).all():
@@ -166,40 +166,41 @@ def _prepare_view(scan: View, viewpoint: np.ndarray | None, name: str) -> ScanPo
     meshed = isinstance(scan, Mesh) and len(scan.faces) > 0
     if isinstance(scan, Mesh) and meshed:
         scan = sanitise(scan, name)
-        given = scan.vertex_normals
+        own_normals = scan.vertex_normals
         border[scan.boundary_vertices] = True
-        index = np.flatnonzero((given != 0).any(axis=1))
+        index = np.flatnonzero((own_normals != 0).any(axis=1))
         index = index[distinct_places(points[index])]
     if len(index) <= NEIGHBOURS:
         raise ValueError(f"{name}: expected more than {NEIGHBOURS} "
                          f"{'vertices with triangles' if meshed else 'distinct points'}, got {len(index)}")
-    # A point that is there twice would halve the distance to the neighbours, and the plane through them.
-    points, border, given = points[index], border[index], None if given is None else given[index]
+    # repeated points were dropped: they would distort distances to neighbours and the planes through them
+    points, border, own_normals = points[index], border[index], None if own_normals is None else own_normals[index]
     distance, near = cKDTree(points).query(points, NEIGHBOURS, workers=search_threads(len(points)))
     spacing = float(np.median(distance[:, 1:5].mean(axis=1)))
-    if meshed and given is not None:
-        return ScanPoints(points, given, border, spacing, 0 * index, index)
-    normals = plane_normals(points, near) if given is None else complete_normals(given, points, near)
+    if meshed and own_normals is not None:
+        return ScanPoints(points, own_normals, border, spacing, 0 * index, index)
+    # bare points: normals by planes, oriented to the viewpoint where one is known, else by their neighbourhood
+    normals = plane_normals(points, near) if own_normals is None else complete_normals(own_normals, points, near)
     if viewpoint is not None:
         normals = normals * np.where(np.einsum("nd,nd->n", normals, viewpoint - points) < 0, -1, 1)[:, None]
-    elif given is None or not one_sign(normals, near):
+    elif own_normals is None or not one_sign(normals, near):
         normals = turn_outward(points, normals, near, distance, 4 * spacing)
     return ScanPoints(points, normals, border, spacing, 0 * index, index)
 
 
 def _split(scan: View, name: str) -> tuple[np.ndarray, np.ndarray | None]:
-    """Points (n, 3), and normals (n, 3) where they are given."""
+    """Split a view into points (n, 3) and normals (n, 3), where it has normals."""
     if isinstance(scan, Mesh):
         return scan.vertices, None
-    given = None if not isinstance(scan, PointCloud) else scan.normals
+    normals = None if not isinstance(scan, PointCloud) else scan.normals
     points = np.asarray(scan.points if isinstance(scan, PointCloud) else scan, dtype=np.float64)
     if points.ndim == 2 and points.shape[1] == 6 and not isinstance(scan, PointCloud):
-        points, given = points[:, :3], points[:, 3:]
+        points, normals = points[:, :3], points[:, 3:]
     if points.ndim != 2 or points.shape[1] != 3:
         raise ValueError(f"{name}: expected points of shape (n, 3), or (n, 6) with normals, got {points.shape}")
-    if given is not None and np.shape(given) != points.shape:
-        raise ValueError(f"{name}: expected one normal for each of {len(points)} points, got {np.shape(given)}")
-    return points, None if given is None else np.asarray(given, dtype=np.float64)
+    if normals is not None and np.shape(normals) != points.shape:
+        raise ValueError(f"{name}: expected one normal for each of {len(points)} points, got {np.shape(normals)}")
+    return points, None if normals is None else np.asarray(normals, dtype=np.float64)
 
 
 def _concatenate(parts: Sequence[ScanPoints]) -> ScanPoints:
@@ -209,13 +210,13 @@ def _concatenate(parts: Sequence[ScanPoints]) -> ScanPoints:
 
 
 def _without_inner_borders(scan: ScanPoints) -> ScanPoints:
-    """A border of one view is none where another view goes on."""
+    """Remove border marks where another view continues the surface."""
     border = scan.border.copy()
     for number in np.unique(scan.view[border]):
-        mine = np.flatnonzero(border & (scan.view == number))
+        own = np.flatnonzero(border & (scan.view == number))
         others = scan.points[(scan.view != number) & ~scan.border]
         if len(others):
-            border[mine] = cKDTree(others).query(scan.points[mine])[0] > 2 * scan.spacing
+            border[own] = cKDTree(others).query(scan.points[own])[0] > 2 * scan.spacing
     return replace(scan, border=border)
 
 

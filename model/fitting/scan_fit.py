@@ -1,4 +1,4 @@
-"""A body on a scan: matches and robust weights, a better body for one matching, and how badly a body explains it."""
+"""The fit of a body to a scan: matches with robust weights, one Gauss-Newton step, and the misfit of a body."""
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
@@ -23,29 +23,29 @@ from .upright import TILT, Upright
 
 Terms = dict[str, Residual]
 
-REACH, FINAL_REACH = 0.2, 0.03       # metres: limits on the distance of matches, first and last
-MIN_COSINE = 0.6                     # between the normals of a match
-# Independent measurements that a whole scan is worth: what the model cannot follow is alike at neighbouring points, so
-# this is far fewer than there are points.
+REACH, FINAL_REACH = 0.2, 0.03       # metres: largest match distance in the first and the last round
+MIN_COSINE = 0.6                     # smallest cosine between the normals of a match
+# A whole scan counts as so many independent measurements. Errors of the model are alike at neighbouring points, so this
+# is far below the number of points.
 EVIDENCE = 400.0
-STRANGE, ODD = np.radians(45), 0.05  # from the nearest known joint on: strange; and what that may vary, radians
+STRANGE, ODD = np.radians(45), 0.05  # joints this far from every known pose are penalised; standard deviation, radians
 
 
 @dataclass(frozen=True, eq=False)
 class Skin:
-    """Places and normals (n, 3) of vertices of a body."""
+    """Positions and normals (n, 3) of vertices of a body."""
 
     places: np.ndarray
     normals: np.ndarray
 
     @cached_property
     def tree(self) -> OrientedPoints:
-        """To find the vertex that is nearest to a point."""
+        """Search tree for the vertex nearest to a point."""
         return OrientedPoints(self.places, self.normals)
 
 
 class ScanData:
-    """A scan, and what is worked out of it once, however many bodies are fitted to it."""
+    """A scan with everything that is computed from it once for all bodies: search tree, cameras, clothing."""
 
     def __init__(self, cloud: ScanPoints, config: ScanFitConfig) -> None:
         self.cloud = cloud
@@ -56,29 +56,29 @@ class ScanData:
 
     @cached_property
     def outside(self) -> Outside | None:
-        """A table of where the cameras saw that nothing is; None without cameras."""
+        """A table of the free space that the cameras saw; None without cameras."""
         return Outside(self.cameras) if self.cameras else None
 
 
 @dataclass(frozen=True, eq=False)
 class BodySample:
-    """The vertices of a body, all or some of them, and which of these are matched.
+    """All or some vertices of a body, and which of these are matched; made by `sample_body`.
 
-    Made by `sample_body`; numbers are those of the sample.
+    Numbers are those within the sample.
     """
 
     body: FixedBody
     ids: np.ndarray                  # (n,) numbers of the vertices on the template
-    spread: np.ndarray               # spread evenly over the body
-    matched: np.ndarray              # of these, those that the scan may say something about
+    spread: np.ndarray               # vertices spread evenly over the body
+    matched: np.ndarray              # those of `spread` that are not on ignored parts
     ignored: np.ndarray              # (n,) bool, vertices of parts that are not to be matched
     part: np.ndarray                 # (n,) the part of each vertex
     contact: Contact
-    gaps: float                      # metres between vertices, where the skin is between those of few
+    gaps: float                      # metres between the vertices of a small sample; 0 for all vertices
 
 
 def sample_body(body: FixedBody, ids: np.ndarray | None, count: int, ignored_parts: Sequence[str]) -> BodySample:
-    """A body with vertices `ids` (n,) of the template, or with all, of which about `count` are matched."""
+    """Sample a body at vertices `ids` (n,) of the template, or at all, of which about `count` are matched."""
     template, skeleton = body.template, body.skeleton
     gaps = 0.0 if ids is None else float(np.sqrt(template.face_areas.sum() / len(ids)))
     all_or_some = np.arange(len(template.vertices)) if ids is None else ids
@@ -91,7 +91,7 @@ def sample_body(body: FixedBody, ids: np.ndarray | None, count: int, ignored_par
 
 @dataclass(frozen=True, eq=False)
 class ScanFit:
-    """One scan and one body, ready to be fitted: a value, made by `scan_fit`.
+    """One scan and one body, ready to be fitted; made by `scan_fit`.
 
     Attributes
     ----------
@@ -143,7 +143,7 @@ class ScanFit:
 
     @property
     def thin(self) -> ScanPoints:
-        """The points of the scan that are matched."""
+        """The points of the scan that are matched, spread evenly."""
         return self.data.thinned(self.scan_points)
 
     @property
@@ -152,34 +152,37 @@ class ScanFit:
         return self.data.thinned(self.config.scan_points // 4)
 
     def on(self, cloud: ScanPoints) -> ScanFit:
-        """The same body with another scan, without landmarks."""
+        """Return the same body with another scan, without landmarks."""
         return replace(self, data=ScanData(cloud, self.config), template_vertices=np.zeros(0, dtype=np.int64),
                        points=np.zeros((0, 3)))
 
     def fix_shape(self, x: np.ndarray) -> ScanFit:
-        """The same scan with the body that has the shape of unknowns (P,), as one of known shape."""
+        """Return the same scan with a body of known shape, that of unknowns (P,)."""
         return replace(self, sample=replace(self.sample, body=self.body.fix_shape(x)))
 
     def some(self, ids: np.ndarray, matched: int) -> ScanFit:
-        """The same with some vertices of the body, whose normals rotate with their parts; so many are matched."""
+        """Return the same fit with some vertices of the body, of which `matched` are matched.
+
+        Their normals rotate with their parts.
+        """
         ids = np.union1d(ids, self.template_vertices)
         return replace(self, sample=sample_body(self.body, ids, matched, self.config.ignored_parts))
 
     def few(self) -> ScanFit:
-        """The same with few vertices of the body and points of the scan: for a search."""
+        """Return the same fit with few vertices and scan points, for a search."""
         template, skeleton = self.body.template, self.body.skeleton
         rings = [skeleton.ring(template, j) for j in range(1, len(skeleton.parents))]
-        # vertices that a search takes
+        # a search takes 3,000 vertices and the rings around the joints
         some = self.some(np.concatenate([spread_points(template.vertices, 3000), *rings]),
                          self.config.model_points // 2)
         return replace(some, scan_points=self.config.scan_points // 2)
 
     def mesh(self, x: np.ndarray) -> Mesh:
-        """The predicted mesh of unknowns (P,)."""
+        """Compute the predicted mesh of unknowns (P,)."""
         return self.body.template.with_vertices(self.body.vertices(x))
 
     def skin(self, x: np.ndarray) -> Skin:
-        """The vertices of unknowns (P,); the last ones are kept."""
+        """Compute vertices and normals at unknowns (P,); the last ones are kept."""
         if not self._last or not np.array_equal(x, self._last[0][0]):
             places = self.body.vertices(x)
             if len(places) == len(self.body.template.vertices):
@@ -190,24 +193,25 @@ class ScanFit:
         return self._last[0][1]
 
     def find_unexplained(self, x: np.ndarray, scan: ScanPoints) -> np.ndarray:
-        """(n,) bool: points of the scan with nothing of the body near."""
+        """Find the points of a scan with no part of the body within 5 cm, (n,) bool."""
         return ~self.skin(x).tree.match(scan.points, scan.normals, 0.05, MIN_COSINE).valid
 
     def beyond(self, x: np.ndarray) -> np.ndarray:
-        """(N,) bool: vertices beyond the border of the picture, of which nothing can be known; none without one."""
+        """Find the vertices beyond the border of the depth picture, (N,) bool; none without a picture."""
         person = self.cloud.person
         return np.zeros(len(self.part), dtype=bool) if person is None else \
             ~person.picture.project(self.body.vertices(x))[2]
 
     def without_ignored(self, cloud: ScanPoints, predicted: Mesh) -> ScanPoints:
-        """A scan without its points on parts of the body that are not to be matched."""
+        """Remove scan points on parts of the body that are not to be matched."""
         if not self.sample.ignored.any():
             return cloud
         found = OrientedPoints(predicted.vertices, predicted.vertex_normals).match(cloud.points, cloud.normals)
         return cloud.some(~(self.sample.ignored[found.index] & found.valid))
 
     def misfit(self, x: np.ndarray, cap: float = 0.05) -> float:
-        """How badly a body explains scan and landmarks, for the choice between starts."""
+        """Compute how badly a body explains scan and landmarks, to choose between starts."""
+        # capped squared distances of scan points; between the vertices of a small sample the skin is nearer by `gaps`
         config, skin = self.config, self.skin(x)
         found = skin.tree.match(self.thin.points, self.thin.normals, cap, MIN_COSINE)
         off = self.thin.points - skin.places[found.index]
@@ -215,32 +219,33 @@ class ScanFit:
         beside = np.sqrt(np.maximum((off**2).sum(axis=1) - along**2, 0))
         squared = np.where(found.valid, along**2 + np.maximum(beside - self.sample.gaps, 0)**2, cap**2)
         apart = (np.minimum(squared, cap**2) * ~(found.valid & self.sample.ignored[found.index])).mean()
-        for weight, ids, found_out in self.objections(skin):
-            apart += weight * (np.minimum(found_out.excess, cap)**2).sum() / len(ids)
+        # violations of space, landmarks, the prior, and unknown joint rotations
+        for weight, ids, violation in self.objections(skin):
+            apart += weight * (np.minimum(violation.excess, cap)**2).sum() / len(ids)
         marked = ((skin.places[self.vertices] - self.points)**2).sum() / config.landmark_sd**2
         return float(EVIDENCE * apart / config.scan_sd**2 + marked) + self.unlikely(x) + float(self.strange(x).sum())
 
     def strange(self, x: np.ndarray) -> np.ndarray:
-        """Energy (J,) of joints of unknowns (P,) that are held as in no known pose; for choices, not for steps."""
+        """Compute the energy (J,) of joint rotations far from all known poses; used to choose, not to step."""
         beyond = self.body.joints_from_known(self.body.split(x)[0]) - STRANGE
         return (np.maximum(beyond, 0) / ODD)**2
 
     def pose_points(self, ids: np.ndarray, poses: np.ndarray, trans: np.ndarray | None = None
                     ) -> tuple[np.ndarray, np.ndarray]:
-        """Some vertices (B, L, 3) in poses (B, J, 3), and normals that rotate with their parts."""
+        """Pose some vertices (B, L, 3) by poses (B, J, 3), with normals that rotate with their parts."""
         return self.body.subject.points(ids).evaluate(poses, trans), self._rotate_normals(ids, poses)
 
     def _rotate_normals(self, ids: np.ndarray, poses: np.ndarray) -> np.ndarray:
-        """(..., L, 3) the normals of some vertices on the template, rotated with their parts in poses (..., J, 3)."""
+        """Rotate the template's normals of some vertices with their parts: (..., L, 3) for poses (..., J, 3)."""
         R = self.body.skeleton.part_rotations(poses)[..., self.part[ids], :, :]
         return (R @ self.body.template.vertex_normals[self.ids[ids], :, None])[..., 0]
 
     def unlikely(self, x: np.ndarray) -> float:
-        """Energy of the pose of unknowns (P,) before anything is measured."""
+        """Compute the prior energy of the pose of unknowns (P,)."""
         return float(sum(term.energy[0] for term in self.prior_terms(x[None]).values()))
 
     def prior_terms(self, x: np.ndarray) -> Terms:
-        """What is known of poses (B, P) beforehand: the Gaussian, joint limits where asked for, and that people stand.
+        """Compute the prior terms of poses (B, P): the Gaussian, joint limits if enabled, and that people stand.
 
         [SCAPE-patent] §0090
         """
@@ -251,17 +256,18 @@ class ScanFit:
         return {"pose_prior": energy.pose_prior_term(x, self.prior, weight), **limits, **stands}
 
     def step(self, x: np.ndarray, scan: ScanPoints, reach: float, steps: int = 1) -> tuple[np.ndarray, Matched]:
-        """Better unknowns (P,) for one matching, and that matching."""
+        """Take a Gauss-Newton step for one matching; return the unknowns (P,) and the matching."""
+        # w_T damps the joint angles; root, place and betas are free
         held = np.full(len(x), self.config.twist_weight)
         held[:3] = held[self.body.n_angles:] = 0
         matched, betas = self.match_at(x, scan, reach), self.body.n_angles + 3
-        # metres: matches closer than this are mostly right
-        stiff = max(1.0, reach / 0.04)             # far matches are often wrong, and shape gives way before pose does
+        # matches beyond 4 cm are often wrong, and shape would give way before the pose: betas are held more
+        stiff = max(1.0, reach / 0.04)
 
         def equations(at: np.ndarray) -> Deferred:
             return matched.equations(at, energy.shape_prior(at, betas, stiff), energy.stay_near(at, x, held))
 
-        # of the first step for a matching, and of another one where that lowers nothing
+        # the first damping, and a stronger one where that step lowers nothing
         for damping in 1e-3, 1e-1:
             ahead = levenberg_marquardt(equations, x[None], steps, 1e-3, damping).x[0]   # [SCAPE] Eq. 11
             if not np.array_equal(ahead, x):
@@ -269,16 +275,17 @@ class ScanFit:
         return ahead, matched
 
     def precision(self, x: np.ndarray) -> np.ndarray:
-        """(P, P) how sharply scan, landmarks and priors together determine unknowns (P,): the Gauss-Newton matrix."""
+        """Compute the Gauss-Newton matrix (P, P) of scan, landmarks and priors: the precision of unknowns (P,)."""
         shape = energy.shape_prior(x[None], self.body.n_angles + 3)
         return self.match_at(x, self.thin, FINAL_REACH).equations(x[None], shape).dense.hessian[0]
 
     def match_at(self, x: np.ndarray, scan: ScanPoints, reach: float) -> Matched:
-        """What draws the body near unknowns x (P,): landmarks, matches, and places where nothing can be."""
+        """Collect the data term near unknowns x (P,): landmarks, matches, and violations of space."""
         skin, free = self.skin(x), np.full(len(self.vertices), self.config.landmark_sd**-2)
         ids, target, normal, weights = self.matches(skin, scan, reach)
         out_ids, out_target, out_normal, out_weights = self.violations(skin)
         points, at = self.body.gather(np.concatenate([self.vertices, ids, out_ids]), x)
+        # landmarks draw to points, matches mostly to planes (a tenth to points), violations to planes
         pull = MatchTargets(points, at, np.concatenate([self.points, target, out_target]),
                             np.concatenate([np.zeros_like(self.points), normal, out_normal]),
                             np.concatenate([free, 0.1 * weights, 0 * out_weights]),
@@ -286,37 +293,40 @@ class ScanFit:
         return Matched(pull, len(free), len(ids), self.prior_terms)
 
     def matches(self, skin: Skin, scan: ScanPoints, reach: float) -> tuple[np.ndarray, ...]:
-        """Vertices, scan points, their normals and weights, by closest points both ways."""
-        config, mine = self.config, self.sample.matched
+        """Match by closest points both ways: vertices, scan points, their normals, and weights."""
+        # from the scan to the body, and from the body to the scan; the latter not across the border of the scan
+        config, vertices = self.config, self.sample.matched
         there = skin.tree.match(scan.points, scan.normals, reach, MIN_COSINE)
-        back = self.data.tree.match(skin.places[mine], skin.normals[mine], reach, MIN_COSINE)
+        back = self.data.tree.match(skin.places[vertices], skin.normals[vertices], reach, MIN_COSINE)
         hit = back.index
-        off = skin.places[mine] - self.cloud.points[hit]
+        off = skin.places[vertices] - self.cloud.points[hit]
         along = np.einsum("nd,nd->n", off, self.cloud.normals[hit])
         beside = np.sqrt(np.maximum((off**2).sum(axis=1) - along**2, 0))
         inner = back.valid & ~self.cloud.border[hit] & (beside < 2 * self.cloud.spacing + 0.3 * np.abs(along))
+        # matches of both directions, weighted by their share and by Geman-McClure
         a, b = there.valid & ~self.sample.ignored[there.index], inner
-        ids = np.concatenate([there.index[a], mine[b]])
+        ids = np.concatenate([there.index[a], vertices[b]])
         target = np.concatenate([scan.points[a], self.cloud.points[hit[b]]])
         normal = np.concatenate([scan.normals[a], self.cloud.normals[hit[b]]])
         distance = np.concatenate([there.distances[a], back.distances[b]])
-        share = np.concatenate([np.full(a.sum(), 1 / len(scan.points)), np.full(b.sum(), 0.5 / len(mine))])
+        share = np.concatenate([np.full(a.sum(), 1 / len(scan.points)), np.full(b.sum(), 0.5 / len(vertices))])
         weights = EVIDENCE / config.scan_sd**2 * share * energy.geman_mcclure(distance, max(reach / 2, 0.015))
         if self.cloud.person is not None:
             under = np.einsum("nd,nd->n", normal, skin.places[ids] - target) < 0
-            # weight of a match of skin below what a depth camera saw, against skin above it
+            # a depth camera sees clothes: skin below what it saw is likely, skin above it is not
             weights = np.where(under, 0.1, 1.0) * weights
         if self.data.clothing is None:
             return ids, target, normal, weights
-        under, over, away = self.data.clothing.below(skin.places[mine], skin.normals[mine])
-        loose = np.full(under.sum(), EVIDENCE / config.clothing_sd**2 / len(mine))
-        return (np.concatenate([ids, mine[under]]), np.concatenate([target, over[under]]),
+        # vertices under clothing are drawn to it only weakly
+        under, over, away = self.data.clothing.below(skin.places[vertices], skin.normals[vertices])
+        loose = np.full(under.sum(), EVIDENCE / config.clothing_sd**2 / len(vertices))
+        return (np.concatenate([ids, vertices[under]]), np.concatenate([target, over[under]]),
                 np.concatenate([normal, away[under]]), np.concatenate([weights, loose]))
 
     def violations(self, skin: Skin) -> tuple[np.ndarray, ...]:
-        """Vertices that are where nothing can be, points and normals of the planes they should reach, weights.
+        """List vertices that violate space, with points and normals of the planes they should reach, and weights.
 
-        A camera would have seen them, they stick out of clothing, or another part of the body is there.
+        A camera would have seen them, they stick out of clothing, or they are inside another part of the body.
         """
         share = EVIDENCE / self.config.scan_sd**2
         ids, targets, normals, weights = [], [], [], []
@@ -329,27 +339,27 @@ class ScanFit:
         return tuple(np.concatenate(part) for part in (ids, targets, normals, weights))
 
     def objections(self, skin: Skin) -> list[tuple[float, np.ndarray, Violation]]:
-        """What says that vertices cannot be where they are: its weight, and the vertices."""
+        """List the violations of space, each with its weight and its vertices."""
         config, places, normals = self.config, skin.places, skin.normals
         mine = self.sample.matched
-        found = [(config.contact_weight, self.sample.spread, self.sample.contact.violation(places[self.sample.spread],
+        out = [(config.contact_weight, self.sample.spread, self.sample.contact.violation(places[self.sample.spread],
                                                                              normals[self.sample.spread]))]
         if self.data.cameras:
-            found.append((config.free_space_weight, mine, free_space_violation(self.data.cameras, places[mine])))
+            out.append((config.free_space_weight, mine, free_space_violation(self.data.cameras, places[mine])))
         if self.data.clothing is not None:
-            found.append((1.0, mine, self.data.clothing.violation(places[mine], normals[mine])))
-        return found
+            out.append((1.0, mine, self.data.clothing.violation(places[mine], normals[mine])))
+        return out
 
 
 def scan_fit(body: FixedBody, cloud: ScanPoints, vertices: np.ndarray, points: np.ndarray, config: ScanFitConfig
              ) -> ScanFit:
-    """A body and a scan, ready to be fitted.
+    """Prepare the fit of a body to a scan.
 
-    `vertices` (L,) int and `points` (L, 3), metres: the landmarks on the template and on the scan, none or more.
+    `vertices` (L,) int and `points` (L, 3), metres, are landmarks on the template and on the scan, none or more.
     """
     sample = sample_body(body, None, config.model_points, config.ignored_parts)
     prior, known = gaussian_prior(body.pose_mean, body.pose_covariance), len(body.pose_examples) >= LEAST_POSES
-    # radians that joints may rotate farther than in the training poses
+    # joints may rotate 0.2 rad farther than in the training poses
     limits = JointLimits.from_poses(body.pose_examples, 1.0, 0.2) if config.joint_limits and known else None
     upright = Upright.of(body.template, body.skeleton, config.up, cloud.person is not None)
     return ScanFit(sample, ScanData(cloud, config), vertices, points, prior, limits, upright,
@@ -358,13 +368,13 @@ def scan_fit(body: FixedBody, cloud: ScanPoints, vertices: np.ndarray, points: n
 
 def prepare_scan_fit(body: FixedBody, scan: Mesh | np.ndarray, vertices: np.ndarray, points: np.ndarray,
                    config: ScanFitConfig) -> tuple[ScanFit, float]:
-    """A body of any size and a scan, ready to be fitted, and the factor by which both were made larger for it.
+    """Prepare the fit of a body of any size to a scan; also return the factor by which both were scaled.
 
-    Lengths of the search are those of a person: a hand or a horse is searched for as large as one. `vertices` (L,) int
-    and `points` (L, 3), metres, are landmarks, none or more.
+    The lengths of the search suit a person, so a hand or a horse is scaled to that size. `vertices` (L,) int and
+    `points` (L, 3), metres, are landmarks, none or more.
     """
     size = float(np.sqrt(body.template.face_areas.sum()))
-    person = 1.36  # metres: root of the surface area of a person
+    person = 1.36  # metres: root of the surface area of a person; bodies from half to twice that size are not scaled
     factor = 1.0 if 0.5 < size / person < 2 else person / size
     sized = body if factor == 1 else ResizedBody(body, factor)
     return scan_fit(sized, prepare_scan(scan, metres=factor), vertices, factor * points, config), factor
@@ -372,10 +382,10 @@ def prepare_scan_fit(body: FixedBody, scan: Mesh | np.ndarray, vertices: np.ndar
 
 @dataclass(frozen=True, eq=False)
 class Matched:
-    """What draws a body near some unknowns: landmarks first, matches of the scan, then places where nothing can be.
+    """The data term near some unknowns: landmarks first, then matches of the scan, then violations of space.
 
-    `landmarks`, `free`: how many points are of the first, and of the second; `known` tells what is known beforehand of
-    unknowns (B, P).
+    `landmarks` and `free` are the numbers of landmarks and of matches. `known` computes the prior terms of unknowns
+    (B, P).
     """
 
     pull: MatchTargets
@@ -384,11 +394,11 @@ class Matched:
     known: Callable[[np.ndarray], Terms]
 
     def equations(self, x: np.ndarray, *more: Residual) -> Deferred:
-        """At unknowns (1, P), with what else is known of them."""
+        """Build the normal equations at unknowns (1, P), with priors and further residuals."""
         return self.pull.equations(x, normal_equations([*self.known(x).values(), *more]))
 
     def energies(self, x: np.ndarray) -> dict[str, float]:
-        """Each term at unknowns (P,)."""
+        """Compute the energy of each term at unknowns (P,)."""
         to_point, to_plane = self.pull.energies(x)
         end = self.landmarks + self.free
         return {"landmarks": float(to_point[:self.landmarks].sum()),
@@ -398,7 +408,7 @@ class Matched:
 
 
 def part_vertices(template: Mesh, skeleton: Skeleton, names: Sequence[str]) -> np.ndarray:
-    """(N,) bool: vertices of the parts of these names."""
+    """Find the vertices of named parts, (N,) bool."""
     unknown = [name for name in names if name not in skeleton.names]
     if unknown:
         raise ValueError(f"ignored_parts: expected names of {', '.join(skeleton.names)}; got {', '.join(unknown)}")

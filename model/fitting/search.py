@@ -1,8 +1,8 @@
-"""Bodies of a model sought on scans of whole people, and on templates of other triangles.
+"""Search for bodies of a model on whole scans, and on templates with other triangles.
 
-1. The body is found by the search of `complete`: typical poses turned every way. Where that leaves something to doubt,
-   limbs are tried elsewhere, which takes as long again.
-2. On a template, which is a surface without holes, the body is then laid: registered until it lies on all of it.
+1. The search of `complete` finds the body: typical poses in all orientations. Where the result is doubtful, limbs are
+   re-initialised, which takes as long again.
+2. A template has no holes, so the body is then registered to all of it.
 """
 from __future__ import annotations
 
@@ -24,41 +24,43 @@ from .starts import best_starts, first_starts, from_nothing
 
 Landmarks = tuple[np.ndarray, np.ndarray]
 NO_LANDMARKS = np.zeros(0, dtype=np.int64), np.zeros((0, 3))
-# Of the body's size: bodies no vertex of which is farther apart come to the same end; so far off a body is what a limb
-# that is elsewhere leaves uncovered; and the share of a scan that is then lost, where a hand is 0.02 of a man.
+# Shares of the body's size (√area): bodies nearer than ALIKE everywhere lead to the same result; scan points farther
+# than FAR are uncovered. From a share LOST of uncovered points on, a limb is missing (a hand is 0.02 of a man).
 ALIKE, FAR, LOST = 0.015, 0.045, 0.005
 
 
 class ModelMismatchError(ValueError):
-    """A model that does not come to lie on a template: it is of something else."""
+    """The model does not fit the template: it is of another kind of body."""
 
 
 def lay_model(model: BodyModel, template: Mesh, progress: Callable[[int, int], None] | None = None) -> Mesh:
-    """Lay the mesh of a model on a template of other triangles.
+    """Lay the mesh of a model on a template with other triangles.
 
     Parameters
     ----------
     model : BodyModel
+        The model.
     template : Mesh
-        Of what the model is of, in a pose that the search finds.
+        Of the same kind of body as the model, in a pose that the search finds.
     progress : callable, optional
         Called as progress(done, total).
 
     Returns
     -------
     Mesh
-        Of the model's triangles; the vertices lie on the template.
+        The model's triangles, with vertices on the template.
 
     Raises
     ------
     ModelMismatchError
+        No body of the model fits the template.
     """
     tell, own = progress or (lambda done, total: None), model.template
     if np.array_equal(own.faces, template.faces) and np.allclose(own.vertices, template.vertices, atol=1e-6):
-        tell(1, 1)                             # a model of this very template
+        tell(1, 1)                             # the model was learned with this template
         return template
-    # of a template: share off the body that was laid on it, and of the body that is stretched, from which on it is
-    # another thing than the model; a woman has 0.004 and 0.0002, a crab 0.005 and 0.088
+    # largest shares of the template that is uncovered, and of the body that is stretched. A woman has 0.004 and 0.0002;
+    # a crab has 0.005 and 0.088.
     other = 0.02, 0.05
     for body in find_bodies(model, template):
         tell(1, 2)
@@ -71,31 +73,33 @@ def lay_model(model: BodyModel, template: Mesh, progress: Callable[[int, int], N
 
 
 def find_bodies(model: BodyModel, scan: Mesh | np.ndarray, landmarks: Landmarks | None = None) -> Iterator[Mesh]:
-    """Yield bodies of a model on a scan, each sought when it is asked for.
+    """Yield likely bodies of a model on a scan, each computed on demand.
 
-    First the likeliest of typical poses; then the best with limbs moved elsewhere, and another body that explains the
-    scan nearly as well, where there are such.
+    First comes the best of the typical poses. Then come the best after re-initialisation of limbs, and another body
+    that explains the scan nearly as well, where they differ.
 
     Parameters
     ----------
     model : BodyModel
+        The model.
     scan : Mesh or (n, 3) float, metres
+        The scan of a whole body.
     landmarks : (L,) int and (L, 3) float, metres, optional
         Few vertices of the model and where they are on the scan.
     """
     body, size = as_body(model), float(np.sqrt(model.template.face_areas.sum()))
-    fit, few, starts = _search(body, scan, landmarks or NO_LANDMARKS)
+    fit, coarse, starts = _search(body, scan, landmarks or NO_LANDMARKS)
 
     def mesh_of(x: np.ndarray) -> Mesh:
-        """The body of unknowns (P,) at its own size."""
+        """Compute the body of unknowns (P,) at its own size."""
         return model.template.with_vertices(body.vertices(fit.body.in_metres(x)[0]))
 
-    first = mesh_of(_solve(fit, few, starts[0]))
-    # what is left uncovered so far off is a limb that is elsewhere; nobody needs to look at such a body
+    first = mesh_of(_solve(fit, coarse, starts[0]))
+    # a body with a limb in the wrong place leaves scan points uncovered: skip it
     lost = share_uncovered(scan, first, FAR * size) > LOST
     if not lost:
         yield first
-    for x in _solve_with_limbs(fit, few, starts):
+    for x in _solve_with_limbs(fit, coarse, starts):
         other = mesh_of(x)
         if lost or np.linalg.norm(other.vertices - first.vertices, axis=1).max() > ALIKE * size:
             yield other
@@ -103,22 +107,22 @@ def find_bodies(model: BodyModel, scan: Mesh | np.ndarray, landmarks: Landmarks 
 
 @one_thread()
 def _search(body: FixedBody, scan: Mesh | np.ndarray, landmarks: Landmarks) -> tuple[ScanFit, ScanFit, np.ndarray]:
-    """The fit of a scan, the same with few vertices, and the unknowns (n, P) of the likeliest bodies, best first."""
+    """Prepare the fit of a scan, the same with few vertices, and the unknowns (n, P) of likely bodies, best first."""
     fit, _ = prepare_scan_fit(body, scan, *landmarks, ScanFitConfig())
     few = fit.few()
     starts = first_starts(fit, few)
-    if len(landmarks[0]) >= 3:                 # few landmarks leave much open: also bodies that begin without
+    if len(landmarks[0]) >= 3:                 # few landmarks determine little: also try starts without them
         starts = np.concatenate([starts, from_nothing(few)])
     return fit, few, best_starts(few, starts)
 
 
 @one_thread()
 def _solve_with_limbs(fit: ScanFit, few: ScanFit, starts: np.ndarray) -> list[np.ndarray]:
-    """Unknowns (P,) of the best start after its limbs were moved elsewhere, and of one that explains nearly as much."""
+    """Solve from the best start after re-initialisation of limbs, and from one that explains nearly as much."""
     return [_solve(fit, few, x) for x in with_limbs(fit, few, starts) if x is not None]
 
 
 @one_thread()
 def _solve(fit: ScanFit, few: ScanFit, x: np.ndarray) -> np.ndarray:
-    """Unknowns (P,) of pose, place and shape together, from those of a start."""
+    """Fit pose, place and shape together from a start; return unknowns (P,)."""
     return solve_jointly(fit, few, x, lambda done: None).x

@@ -1,4 +1,4 @@
-"""Settings of bringing a body to a scan."""
+"""Settings of the fit of a body to a scan."""
 from __future__ import annotations
 
 from dataclasses import dataclass
@@ -8,7 +8,7 @@ from scanprep.ranges import Count, Positive, Seed, Settings, Signed
 
 @dataclass(frozen=True)
 class ScanFitConfig(Settings):
-    """Settings of bringing a body to a scan.
+    """Settings of the fit of a body to a scan.
 
     Attributes
     ----------

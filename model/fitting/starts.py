@@ -1,4 +1,4 @@
-"""Where the fit of a scan begins: bodies that meet the landmarks, or without any typical poses, rotated every way."""
+"""Initialisation of the fit to a scan: bodies that meet the landmarks, or typical poses in all orientations."""
 from __future__ import annotations
 
 import numpy as np
@@ -16,19 +16,19 @@ from .scan import ScanPoints, spread_points
 from .scan_fit import EVIDENCE, ScanFit
 from .upright import SPREAD, SPREAD_OF_MANY
 
-AXES = 4                             # directions of the training poses along which a search from landmarks starts
-COARSE = (0.25, 0.2, 0.15, 0.12, 0.1)    # metres: reaches of the first rounds, on few points
-FINALISTS, ELSEWHERE = 4, 0.2        # starts that are carried through all these rounds; metres by which they differ
-VERTICES, POINTS = 500, 120          # of body and scan, in the first look at all turns, or all draws
-PROMISING, STANDING = 0.4, 0.15      # share of all placements, those least denied by the camera, that are compared
-AT_ONCE = 1000                       # points that are compared at a time
-BLIND, APART = 24, 0.08              # of them, starts that differ by so many metres on average
+AXES = 4                             # principal directions of the training poses from which a landmark search starts
+COARSE = (0.25, 0.2, 0.15, 0.12, 0.1)    # metres: largest match distance of the first rounds, on few points
+FINALISTS, ELSEWHERE = 4, 0.2        # starts that go through all these rounds, and metres by which they differ
+VERTICES, POINTS = 500, 120          # vertices and scan points by which all orientations or random poses are compared
+PROMISING, STANDING = 0.4, 0.15      # share of placements, with the least free-space violation, that go on
+AT_ONCE = 1000                       # points that are compared at a time, so that they stay in the cache
+BLIND, APART = 24, 0.08              # starts without landmarks, and metres by which they differ on average
 
 
 def first_starts(fit: ScanFit, few: ScanFit) -> np.ndarray:
-    """Bodies (n, P) to start from: those that meet the landmarks, or, with fewer than three, typical poses on the scan.
+    """Find bodies (n, P) to start from: from the landmarks, or from typical poses with fewer than three landmarks.
 
-    The same with `few` vertices judges them.
+    `few` is the same fit with few vertices, which judges the starts.
     """
     if len(fit.vertices) < 3:
         return from_nothing(few)
@@ -36,13 +36,13 @@ def first_starts(fit: ScanFit, few: ScanFit) -> np.ndarray:
     if not fit.config.correspondences:
         return marked
     pairs = find_correspondences(fit.body.template, fit.cloud.points, (fit.vertices, fit.points))
-    # metres: correspondences are that far off, and not independently of each other
+    # 5 cm: correspondences are so inaccurate, and their errors depend on each other
     more = from_landmarks(fit, few, pairs.template_vertices, pairs.scan_points, 0.05)
     return np.concatenate([more, marked])
 
 
 def going_on(fit: ScanFit, pose: np.ndarray, trans: np.ndarray, betas: np.ndarray | None) -> np.ndarray:
-    """The body (1, P) in which an earlier fit of the scan ended: pose (J, 3), trans (3,), and betas if it has some."""
+    """Start from an earlier fit of the scan: unknowns (1, P) of pose (J, 3), trans (3,), and betas where known."""
     x = fit.body.join(pose[None], trans[None])
     if fit.body.n_betas and betas is not None:
         x[:, fit.body.n_angles + 3:] = betas
@@ -50,15 +50,13 @@ def going_on(fit: ScanFit, pose: np.ndarray, trans: np.ndarray, betas: np.ndarra
 
 
 def from_landmarks(fit: ScanFit, few: ScanFit, vertices: np.ndarray, points: np.ndarray, sd: float) -> np.ndarray:
-    """The likeliest bodies (n, P) of the mean shape that meet landmarks (L,), (L, 3) to within sd metres, best first.
-
-    They are distinct.
-    """
+    """Find the likeliest distinct bodies (n, P) of mean shape that meet landmarks (L,), (L, 3) within `sd` metres."""
     mean = np.zeros(fit.body.n_angles + 3 + fit.body.n_betas)
     body = fit.body.fix_shape(mean)
     follow = body.follow(vertices, mean)
     x, _ = search_bodies(body, follow, points, sd, fit.prior, AXES)
-    candidates = 3  # starts that are carried on from the landmarks to the scan
+    # three candidates go on to the scan, each with random poses that the landmarks leave open
+    candidates = 3
     x = x[distinct_bodies(body.subject.points(few.ids[few.sample.spread]).evaluate(*body.split(x)[:2]), candidates)]
     drawn = np.concatenate([x, *(sample_around(body, follow, start, points, sd, fit.prior, fit.config.random_starts,
                                                fit.rng)
@@ -69,7 +67,7 @@ def from_landmarks(fit: ScanFit, few: ScanFit, vertices: np.ndarray, points: np.
 
 
 def coarse_cost(fit: ScanFit, x: np.ndarray) -> np.ndarray:
-    """How badly bodies (n, P) explain the scan, on very few points, whatever parts enter each other."""
+    """Compute how badly bodies (n, P) explain the scan, on very few points and without self-contact."""
     scan, ids = fit.cloud.thin(POINTS), spread_points(fit.body.template.vertices[fit.ids], VERTICES)
     places, normals = fit.pose_points(ids, *fit.body.split(x)[:2])
     apart = np.array([_distances(y, n, np.eye(3)[None], np.zeros((1, 3)), scan)[0]
@@ -82,9 +80,9 @@ def coarse_cost(fit: ScanFit, x: np.ndarray) -> np.ndarray:
 
 def sample_around(body: FixedBody, follow: Follow, x: np.ndarray, targets: np.ndarray, sd: float, prior: GaussianPrior,
                   count: int, rng: np.random.Generator) -> np.ndarray:
-    """Draws (count, P) of what the landmarks and the pose prior leave open around their optimum x (P,).
+    """Draw unknowns (count, P) around the optimum x (P,) of landmarks and pose prior, by Laplace's approximation.
 
-    The normal distribution whose precision is the Gauss-Newton matrix (Laplace's approximation).
+    That is the normal distribution whose precision is the Gauss-Newton matrix.
     """
     weights = np.full(len(targets), sd**-2)
     terms = [energy.point_to_point(follow(x[None]), targets, weights), energy.pose_prior_term(x[None], prior)]
@@ -96,14 +94,14 @@ def sample_around(body: FixedBody, follow: Follow, x: np.ndarray, targets: np.nd
 
 
 def best_starts(fit: ScanFit, starts: np.ndarray) -> np.ndarray:
-    """Starts (n, P) after a few rounds on few points, the one that explains most first; the worst drop out early.
+    """Refine starts (n, P) by a few rounds on few points; return the best, best first.
 
-    As long as there are many, the shape is held.
+    The worst drop out early. While there are many, the shape is held.
     """
     ends, free = np.array(starts), fit.body.n_angles + 3
     if len(ends) > FINALISTS:
         held = fit.fix_shape(ends[0])
-        # of many starts, those that go on after the first round: on 14 half views the bodies are those of all 24
+        # 12 starts go on after the first round: on 14 half views the result was that of all 24
         for reach, left in zip(COARSE[:2], (len(ends), 12), strict=True):
             ends = ends[:left]
             ends[:, :free] = [approach(held, x[:free], (reach,)) for x in ends]
@@ -117,46 +115,46 @@ def best_starts(fit: ScanFit, starts: np.ndarray) -> np.ndarray:
 
 
 def sample_vertices(fit: ScanFit, x: np.ndarray) -> np.ndarray:
-    """Some vertices (n, L, 3) of bodies (n, P), in one shape, to tell which are alike."""
+    """Compute some vertices (n, L, 3) of bodies (n, P), all in one shape, to compare them."""
     return fit.body.subject.points(fit.sample.spread).evaluate(*fit.body.split(x)[:2])
 
 
 def approach(fit: ScanFit, x: np.ndarray, reaches: tuple[float, ...] = COARSE) -> np.ndarray:
-    """Unknowns (P,) after a few rounds on few points."""
+    """Refine unknowns (P,) by a few rounds on few points."""
     for reach in reaches:
-        # for each matching of them: they are too few to settle with one
+        # two steps for each matching
         x, _ = fit.step(x, fit.coarse, reach, 2)
     return x
 
 
 def from_nothing(fit: ScanFit) -> np.ndarray:
-    """The likeliest bodies (n, P) for a scan without landmarks, distinct and best first.
+    """Find the likeliest distinct bodies (n, P) for a scan without landmarks, best first.
 
-    Typical poses are turned in every direction, where no axis is known to be up, laid on the scan and compared
-    with what it shows and with what its camera must have seen.
+    Typical poses in all orientations, or upright ones where up is known, are placed on the scan. They are compared with
+    its points and with the free space that its cameras saw.
     """
     x, _ = placements(fit)
     return x[distinct_bodies(sample_vertices(fit, x), BLIND, APART)]
 
 
 def starting_poses(fit: ScanFit) -> np.ndarray:
-    """Poses (M, J, 3) to try: those that are known, or steps along the Gaussian's main directions."""
+    """Choose poses (M, J, 3) to try: known ones, or steps along the principal directions of the Gaussian."""
     body = fit.body
     if not len(body.known_poses):
         return typical_poses(body.pose_mean, body.pose_covariance, AXES)
     mean = body.pose_mean.copy()
     mean[0] = 0
-    # tried at most
+    # at most 100, as different as possible
     return pick_varied(np.concatenate([mean[None], body.known_poses]), 100)
 
 
 def pick_varied(poses: np.ndarray, count: int) -> np.ndarray:
-    """Those `count` of the poses (M, J, 3), the first among them, that differ most from one another."""
+    """Pick `count` poses (M, J, 3) that differ most from one another, the first among them."""
     return poses if len(poses) <= count else poses[farthest_points(poses.reshape(len(poses), -1), count, 0)]
 
 
 def all_rotations(count: int) -> np.ndarray:
-    """Rotations (count, 3, 3) spread evenly, with no axis preferred: the quaternions of two golden spirals."""
+    """Spread rotations (count, 3, 3) evenly, with no axis preferred: quaternions on super-Fibonacci spirals."""
     i = np.arange(count) + 0.5
     r, R = np.sqrt(i / count), np.sqrt(1 - i / count)
     a, b = 2 * np.pi * i / np.sqrt(2), 2 * np.pi * i / 1.533751168755204288118041
@@ -167,7 +165,7 @@ def all_rotations(count: int) -> np.ndarray:
 
 
 def placements(fit: ScanFit) -> tuple[np.ndarray, np.ndarray]:
-    """The best of all poses in all turns, laid on the scan: unknowns (POOL, P) and costs, best first."""
+    """Place all poses in all orientations on the scan; return the best 200 unknowns (n, P) and costs, best first."""
     body = fit.body
     poses, (turns, lift, up) = starting_poses(fit), candidate_rotations(fit)
     scan, ids = fit.cloud.thin(POINTS), spread_points(body.template.vertices[fit.ids], VERTICES)
@@ -178,22 +176,21 @@ def placements(fit: ScanFit) -> tuple[np.ndarray, np.ndarray]:
                       _stood(y, n, turns, lift, toward, scan.points, up)
                       for y, n in zip(places, normals, strict=True)])
 
-    # at first on a third of the vertices and points: what the cameras deny least, then what lies nearest to the scan
-    few = (places[:, ::3], normals[:, ::3])
-    cost = free_space_cost(fit, few[0], turns, shift, np.ones(shift.shape[:2], dtype=bool))
+    # first on a third of the vertices and points: least free-space violation, then nearest to the scan
+    third = (places[:, ::3], normals[:, ::3])
+    cost = free_space_cost(fit, third[0], turns, shift, np.ones(shift.shape[:2], dtype=bool))
     share = PROMISING if fit.upright is None else STANDING
     likely = cost <= (np.quantile(cost, share) if fit.data.outside is not None else np.inf)
     cost[~likely] = np.inf
-    cost[likely] += distance_cost(*few, turns, shift, scan.some(np.arange(0, len(scan.points), 3)), likely)[likely]
+    cost[likely] += distance_cost(*third, turns, shift, scan.some(np.arange(0, len(scan.points), 3)), likely)[likely]
 
-    # then the best of these on all
-    # placements that are compared on all points, after a first look on a third: fifteen times as many as are kept
+    # then the best 3,000 of these on all points: fifteen times as many as are kept
     fine = 3000
     best = cost <= np.partition(cost, min(fine, cost.size - 1), axis=None)[min(fine, cost.size - 1)]
     best &= np.isfinite(cost)
     whole = free_space_cost(fit, places, turns, shift, best) + distance_cost(places, normals, turns, shift, scan, best)
     cost = np.where(best, whole, np.inf)
-    # best placements that are kept
+    # the best 200 become unknowns
     order = np.argsort(cost, axis=None, kind="stable")[:200]
     which, turn = np.unravel_index(order, cost.shape)
     x = np.array([body.join(_rotate_root(poses[a], turns[b]), np.zeros(3)) for a, b in zip(which, turn, strict=True)])
@@ -204,21 +201,24 @@ def placements(fit: ScanFit) -> tuple[np.ndarray, np.ndarray]:
 
 def free_space_cost(fit: ScanFit, places: np.ndarray, turns: np.ndarray, shift: np.ndarray, asked: np.ndarray
                     ) -> np.ndarray:
-    """(A, T) how much cameras deny poses (A, L, 3) in turns (T, 3, 3) at shifts (A, T, 3), where it is asked."""
+    """Compute free-space violations (A, T) of poses (A, L, 3) in orientations (T, 3, 3) at shifts (A, T, 3).
+
+    Only for pairs that are `asked` (A, T).
+    """
     table, rough, cost = fit.data.outside, np.swapaxes(turns, 1, 2).astype(np.float32), np.zeros(asked.shape)
     if table is not None:
         for a, y in enumerate(places):
-            some = asked[a]
+            chosen = asked[a]
             # one product for all turns: (L, 3) with (3, T 3)
-            turned = y.astype(np.float32) @ rough[some].swapaxes(0, 1).reshape(3, -1)
-            out = table.at(turned.reshape(len(y), -1, 3) + shift[a, some].astype(np.float32))
-            cost[a, some] = fit.config.free_space_weight * (out**2).mean(axis=0)
+            turned = y.astype(np.float32) @ rough[chosen].swapaxes(0, 1).reshape(3, -1)
+            out = table.at(turned.reshape(len(y), -1, 3) + shift[a, chosen].astype(np.float32))
+            cost[a, chosen] = fit.config.free_space_weight * (out**2).mean(axis=0)
     return cost
 
 
 def distance_cost(places: np.ndarray, normals: np.ndarray, turns: np.ndarray, shift: np.ndarray, scan: ScanPoints,
                   asked: np.ndarray) -> np.ndarray:
-    """(A, T) mean squared distance of the scan to poses in turns at shifts, where it is asked."""
+    """Compute mean squared distances (A, T) of the scan to poses in orientations at shifts, for `asked` pairs."""
     cost = np.zeros(asked.shape)
     for a, (y, n) in enumerate(zip(places, normals, strict=True)):
         if asked[a].any():
@@ -227,24 +227,24 @@ def distance_cost(places: np.ndarray, normals: np.ndarray, turns: np.ndarray, sh
 
 
 def candidate_rotations(fit: ScanFit) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
-    """Rotations (T, 3, 3) to try, how high the body is placed in each (T,), and along which direction (T, 3).
+    """Choose rotations (T, 3, 3) to try, the height of the body in each (T,), and the direction of height (T, 3).
 
-    Its upper end is laid on that of the scan at 0, its lower end at 1. Of a body that stands as much as nothing may be
-    beyond the picture; a scan that is much shorter than a body, and that no camera explains, is of either half. Others
-    have no direction: their middle is laid on that of the scan.
+    Height 0 puts the upper end of the body on that of the scan, 1 the lower end. A body that stands may extend beyond
+    the picture. A scan much shorter than the body, without cameras, may be of either half. Otherwise there is no
+    direction: centroids are aligned.
     """
-    # about 25 degrees between neighbours
+    # 600 rotations: about 25 degrees between neighbours
     upright, every = fit.upright, all_rotations(600)
     if upright is not None:
         turns = upright.rotations(all_rotations(SPREAD if len(upright.ups) == 1 else SPREAD_OF_MANY))
         up = upright.ups[np.argmax(turns @ upright.of_body @ upright.ups.T, axis=1)]
-        # heights at which a body that stands is laid on what is seen of it
+        # five heights for a body that stands
         lift = np.linspace(0, 1, 5)
     else:
         extent = np.ptp(fit.body.template.vertices, axis=0)
         off = fit.cloud.points - fit.cloud.points.mean(axis=0)
         length = np.ptp(off @ np.linalg.svd(off[::1 + len(off) // 5000], full_matrices=False)[2][0])
-        # of a body's length: a scan that is shorter is of a part of it; half a man had 0.49
+        # a scan shorter than 0.65 of the body's length shows only part of it: half a man had 0.49
         if fit.data.cameras or length > 0.65 * extent.max():
             return every, np.zeros(len(every)), None
         turns, up, lift = every, every[:, :, extent.argmax()], np.array([0, 0.5, 1])
@@ -252,15 +252,18 @@ def candidate_rotations(fit: ScanFit) -> tuple[np.ndarray, np.ndarray, np.ndarra
 
 
 def _facing(n: np.ndarray, turns: np.ndarray, toward: np.ndarray) -> np.ndarray:
-    """(T, L) 1 for vertices with normals (L, 3) that face a camera in direction (C, 3) when turned; without one all."""
+    """Find vertices with normals (L, 3) that, when rotated, face a camera in directions (C, 3): 1 or 0, (T, L).
+
+    Without cameras all do.
+    """
     if not len(toward):
         return np.ones((len(turns), len(n)))
-    # cosine to the camera's direction from which a vertex counts as seen
+    # a vertex counts as seen from a cosine of 0.15 on, as scanners lose grazing surfaces
     return np.any([(to @ turns) @ n.T > 0.15 for to in toward], axis=0).astype(float)
 
 
 def _laid(y: np.ndarray, n: np.ndarray, turns: np.ndarray, toward: np.ndarray, scan: np.ndarray) -> np.ndarray:
-    """Shifts (T, 3) that lay the middle of what faces a camera on that of a scan (m, 3)."""
+    """Compute shifts (T, 3) that put the centroid of the vertices that face a camera on that of a scan (m, 3)."""
     facing = _facing(n, turns, toward)
     shown = facing @ y / np.maximum(facing.sum(axis=1, keepdims=True), 1)
     return scan.mean(axis=0) - (turns @ shown[:, :, None])[..., 0]
@@ -268,7 +271,9 @@ def _laid(y: np.ndarray, n: np.ndarray, turns: np.ndarray, toward: np.ndarray, s
 
 def _stood(y: np.ndarray, n: np.ndarray, turns: np.ndarray, lift: np.ndarray, toward: np.ndarray, scan: np.ndarray,
            up: np.ndarray) -> np.ndarray:
-    """Shifts (T, 3) that raise a body along `up` (T, 3) as `lift` (T,) says, and lay what is level with the scan on it.
+    """Compute shifts (T, 3) that raise a body along `up` (T, 3) to height `lift` (T,), then centre it on the scan.
+
+    Only vertices at heights of the scan count for the centre.
     """
     high, own = (scan @ up.T).T, np.einsum("ld,tde,te->tl", y, np.swapaxes(turns, 1, 2), up)
     raised = ((1 - lift) * (high.max(axis=1) - own.max(axis=1)) + lift * (high.min(axis=1) - own.min(axis=1)))
@@ -281,17 +286,17 @@ def _stood(y: np.ndarray, n: np.ndarray, turns: np.ndarray, lift: np.ndarray, to
 
 
 def _distances(y: np.ndarray, n: np.ndarray, turns: np.ndarray, shift: np.ndarray, scan: ScanPoints) -> np.ndarray:
-    """Mean squared distance (T,) of the scan to one pose turned every way; places and normals in one space."""
+    """Compute mean squared distances (T,) of the scan to one pose in all orientations, by positions and normals."""
     points, directions = (scan.points - shift[:, None]) @ turns, scan.normals @ turns
-    normals = 0.1  # metres that a difference of normals of unit length weighs
+    normals = 0.1  # metres: weight of a unit difference of normals
     ask = np.concatenate([points, normals * directions], axis=2).reshape(-1, 6).astype(np.float32)
     have = np.hstack([y, normals * n]).astype(np.float32)
-    # |a - b|² = |a|² + (|b|², b)·(1, -2 a); a piece at a time, so that it stays near the processor
+    # |a - b|² = |a|² + (|b|², b)·(1, -2 a); a piece at a time, so that it stays in the cache
     have = np.hstack([(have**2).sum(axis=1, keepdims=True), have])
     other = np.hstack([np.ones_like(ask[:, :1]), -2 * ask])
-    nearest = np.concatenate([(have @ some.T).min(axis=0)
-                              for some in np.array_split(other, 1 + len(other) // AT_ONCE)]) + (ask**2).sum(axis=1)
-    # metres: further off is as bad
+    nearest = np.concatenate([(have @ piece.T).min(axis=0)
+                              for piece in np.array_split(other, 1 + len(other) // AT_ONCE)]) + (ask**2).sum(axis=1)
+    # distances beyond 15 cm are all equally bad
     return np.minimum(nearest, 0.15**2).reshape(len(turns), len(scan.points)).mean(axis=1)
 
 

@@ -1,4 +1,4 @@
-"""Pose and shape of a body from its registered vertices, by Levenberg-Marquardt."""
+"""Fit pose and shape of a body to its registered vertices, by Levenberg-Marquardt."""
 from __future__ import annotations
 
 from collections.abc import Callable
@@ -35,7 +35,12 @@ class FitConfig(Settings):
     tolerance : float
         Relative decrease of the energy below which to stop.
     n_betas : int, optional
-        Use the first of the model's shape components only (`fit_shape`).
+        Use only so many first shape components of the model (`fit_shape`).
+
+    Examples
+    --------
+    >>> FitConfig(polish=0).sample
+    800
     """
 
     sample: Count = 800
@@ -47,11 +52,37 @@ class FitConfig(Settings):
 
 @dataclass(frozen=True, eq=False)
 class PoseFit:
-    """A fitted pose."""
+    """Result of `fit_pose`.
 
-    pose: np.ndarray        # (J, 3), radians
-    trans: np.ndarray       # (3,), metres
-    vertices: np.ndarray    # (N, 3), metres
+    Attributes
+    ----------
+    pose : (J, 3) float, radians
+        Fitted pose.
+    trans : (3,) float, metres
+        Fitted place.
+    vertices : (N, 3) float, metres
+        The fitted body.
+    rms : float, metres
+        Root mean square distance of corresponding vertices.
+    mean : float, metres
+        Mean distance of corresponding vertices.
+    converged : bool
+        Whether the energy stopped falling before the largest number of steps.
+    iterations : int
+        Steps that were taken.
+
+    Examples
+    --------
+    >>> from model import fit_pose, load_built_in_model
+    >>> subject = load_built_in_model().subject(None)
+    >>> fit = fit_pose(subject, subject.vertices(np.full((16, 3), 0.1)))
+    >>> fit.converged, fit.vertices.shape
+    (True, (5002, 3))
+    """
+
+    pose: np.ndarray
+    trans: np.ndarray
+    vertices: np.ndarray
     rms: float
     mean: float
     converged: bool
@@ -60,25 +91,56 @@ class PoseFit:
 
 @dataclass(frozen=True, eq=False)
 class ShapeFit(PoseFit):
-    """A fitted shape and pose; `betas` (K,) in standard deviations."""
+    """Result of `fit_shape`: what `PoseFit` holds, and the betas.
+
+    Attributes
+    ----------
+    betas : (K,) float
+        Shape coefficients, standard deviations; those that were not fitted are 0.
+
+    Examples
+    --------
+    >>> from model import fit_shape, load_built_in_model
+    >>> model = load_built_in_model()
+    >>> fit = fit_shape(model, model.template.vertices, FitConfig(n_betas=5, polish=0))
+    >>> fit.betas.shape, fit.rms < 0.01
+    ((30,), True)
+    """
 
     betas: np.ndarray
 
 
 @one_thread()
 def fit_pose(subject: Subject, vertices: np.ndarray, config: FitConfig | None = None) -> PoseFit:
-    """Pose and place of a known body from all its vertices.
+    """Fit pose and place of a body of known shape to all its vertices.
 
     Parameters
     ----------
     subject : Subject
+        The body, see `BodyModel.subject`.
     vertices : (N, 3) float, metres
+        Registered vertices, in the order of the model's template.
     config : FitConfig, optional
+        Settings.
+
+    Returns
+    -------
+    PoseFit
+        Pose, place, the fitted vertices and their distance from the given ones.
 
     Raises
     ------
     ValueError
-        Vertices of another count or not finite.
+        Another number of vertices, or vertices that are not finite.
+
+    Examples
+    --------
+    >>> from model import load_built_in_model
+    >>> subject = load_built_in_model().subject(None)
+    >>> pose = np.full((16, 3), 0.1)
+    >>> fit = fit_pose(subject, subject.vertices(pose, [0.0, 0.0, 1.0]))
+    >>> np.allclose(fit.pose, pose, atol=1e-3), np.allclose(fit.trans, [0, 0, 1], atol=1e-3)
+    (True, True)
     """
     return PoseFitter(subject, config).fit(vertices)
 
@@ -96,19 +158,21 @@ class PoseFitter:
         return self.subject.points(np.arange(self.subject.n_vertices))
 
     def fit(self, vertices: np.ndarray, start: np.ndarray | None = None) -> PoseFit:
-        """Pose and place from all vertices (N, 3), from a start that is sought unless a pose (J, 3) is given."""
+        """Fit pose and place to all vertices (N, 3), from a start pose (J, 3) or from starts that are found."""
         subject, config, chosen = self.subject, self.config, self._chosen
         vertices = _check_vertices(vertices, subject.n_vertices)
         J = len(subject.skeleton.parents)
+        # steps on a sample of the vertices, from each start until one is within 2% of the body's extent
         best: Minimum[np.ndarray] | None = None
         for x in _starts(subject, vertices) if start is None else [_unknowns_of_pose(subject, vertices, start)]:
-            found = _minimise(_equations(self._sample, vertices[chosen]), x[None], J, config.iterations,
+            end = _minimise(_equations(self._sample, vertices[chosen]), x[None], J, config.iterations,
                               config.tolerance)
-            if best is None or found.energy[0] < best.energy[0]:
-                best = found
-            if np.sqrt(found.energy[0] / len(chosen)) < 0.02 * np.ptp(vertices, axis=0).max():
+            if best is None or end.energy[0] < best.energy[0]:
+                best = end
+            if np.sqrt(end.energy[0] / len(chosen)) < 0.02 * np.ptp(vertices, axis=0).max():
                 break
         assert best is not None
+        # a few more steps on all vertices
         steps = best.iterations
         if len(chosen) < subject.n_vertices and config.polish:
             best = _minimise(_equations(self._everything, vertices), best.x, J, config.polish, config.tolerance)
@@ -120,19 +184,35 @@ class PoseFitter:
 
 @one_thread()
 def fit_shape(model: BodyModel, vertices: np.ndarray, config: FitConfig | None = None) -> ShapeFit:
-    """Shape, pose and place of an unknown body from all its vertices.
+    """Fit shape, pose and place of an unknown body to all its vertices.
 
     Parameters
     ----------
     model : BodyModel
-        With shape components.
+        A model with shape components.
     vertices : (N, 3) float, metres
+        Registered vertices, in the order of the model's template.
     config : FitConfig, optional
+        Settings.
+
+    Returns
+    -------
+    ShapeFit
+        Betas, pose, place, the fitted vertices and their distance from the given ones.
 
     Raises
     ------
     ValueError
-        Vertices of another count or not finite, or a model without shape components.
+        Another number of vertices, vertices that are not finite, or a model without shape components.
+
+    Examples
+    --------
+    >>> from model import load_built_in_model
+    >>> model = load_built_in_model()
+    >>> person = model.vertices(np.zeros((16, 3)), np.array([1.0, -2.0, 0.5]))
+    >>> fit = fit_shape(model, person, FitConfig(n_betas=3))
+    >>> np.allclose(fit.betas[:3], [1.0, -2.0, 0.5], atol=0.05)
+    True
     """
     return ShapeFitter(model, config).fit(vertices)
 
@@ -155,7 +235,7 @@ class ShapeFitter:
         return self.model.points(self._chosen, n_betas=self.n_betas)
 
     def first(self, n_betas: int) -> ShapeFitter:
-        """The fitter of the first components only, with points that are prepared already."""
+        """Return a fitter of the first components only, which shares the prepared points."""
         if n_betas > self.n_betas:
             raise ValueError(f"n_betas: expected 1..{self.n_betas}, got {n_betas}")
         fewer = ShapeFitter(self.model, replace(self.config, n_betas=n_betas))
@@ -163,13 +243,14 @@ class ShapeFitter:
         return fewer
 
     def fit(self, vertices: np.ndarray, start: PoseFit | None = None) -> ShapeFit:
-        """Shape, pose and place from all vertices (N, 3), from a start that is sought unless a fit is given."""
+        """Fit shape, pose and place to all vertices (N, 3), from a given fit or from that of the mean person."""
         model, config, K = self.model, self.config, self.n_betas
         vertices = _check_vertices(vertices, len(model.template.vertices))
         J = len(model.skeleton.parents)
         start = start or self._mean_person.fit(vertices)
         betas = start.betas[:K] if isinstance(start, ShapeFit) else np.zeros(K)
         x = np.concatenate([start.pose.ravel(), start.trans, betas])
+        # steps on a sample; then all vertices, with the sample's Gauss-Newton matrix as a first guess
         best = _minimise(_equations(self._points, vertices[self._chosen], self._share), x[None], J,
                          config.iterations, config.tolerance)
         x, converged, steps = best.x[0], bool(best.converged[0]), best.iterations
@@ -183,18 +264,18 @@ class ShapeFitter:
 
 
 def spread_vertices(vertices: np.ndarray, count: int) -> np.ndarray:
-    """Indices (≤ count,) of vertices spread evenly, each next one farthest from those before."""
+    """Choose at most `count` evenly spread vertices, each the farthest from those before; return indices."""
     return np.arange(len(vertices)) if count >= len(vertices) else np.sort(farthest_points(vertices, count))
 
 
 def share_of_vertices(vertices: np.ndarray, chosen: np.ndarray) -> np.ndarray:
-    """(L,) how many of all vertices (N, 3) lie nearest to each of those chosen (L,)."""
+    """Count how many of all vertices (N, 3) are nearest to each chosen one, (L,)."""
     nearest = cKDTree(vertices[chosen]).query(vertices)[1]
     return np.bincount(nearest, minlength=len(chosen)).astype(float)
 
 
 def _starts(subject: Subject, vertices: np.ndarray) -> list[np.ndarray]:
-    """Pose and place to start from: each part where it fits best, then the whole body stiff."""
+    """List starts: every part with its own Procrustes rotation, then the whole body with that of the root."""
     J = len(subject.skeleton.parents)
     rest = subject.template.with_vertices(np.asarray(subject.vertices(np.zeros((J, 3))), dtype=np.float64))
     R = subject.skeleton.fit_rotations(rest, vertices)
@@ -206,26 +287,26 @@ def _starts(subject: Subject, vertices: np.ndarray) -> list[np.ndarray]:
 
 
 def _unknowns_of_pose(subject: Subject, vertices: np.ndarray, pose: np.ndarray) -> np.ndarray:
-    """Unknowns (3J + 3,) for a pose, standing where it fits best."""
+    """Compute unknowns (3J + 3,) for a pose, with the place that fits best."""
     posed = np.asarray(subject.vertices(pose), dtype=np.float64)
     return np.concatenate([pose.ravel(), (vertices - posed).mean(axis=0)])
 
 
 def _minimise(equations: Callable[[np.ndarray], Dense], x: np.ndarray, J: int, iterations: int, tolerance: float
               ) -> Minimum[np.ndarray]:
-    """Unknowns (1, P) whose first are a pose, which is kept below π."""
+    """Minimise over unknowns (1, P) that begin with a pose, whose rotations are kept below π."""
     def retract(x: np.ndarray, step: np.ndarray) -> np.ndarray:
         out = x + step
         out[0, :3 * J] = twists(out[0, :3 * J].reshape(J, 3)).ravel()
         return out
 
-    # square metres, over all points: a step that gains less is none
+    # square metres, over all points: a step that gains less counts as no progress
     return levenberg_marquardt(equations, x, iterations, tolerance, exact=1e-15, retract=retract)
 
 
 def _equations(points: PointOperator | ShapedPoints, target: np.ndarray, weights: np.ndarray | None = None
                ) -> Callable[[np.ndarray], Dense]:
-    """The normal equations of points that are to be at their targets (L, 3), times the roots (L,) of their weights."""
+    """Build the normal equations of points that should be at their targets (L, 3), with weights (L,)."""
     posed = PosedPoints(points)
     root = np.ones(len(target)) if weights is None else np.sqrt(weights)
 
@@ -239,9 +320,9 @@ def _equations(points: PointOperator | ShapedPoints, target: np.ndarray, weights
 
 def _refine_all_vertices(model: BodyModel, target: np.ndarray, x: np.ndarray, matrix: np.ndarray, config: FitConfig
                          ) -> tuple[np.ndarray, bool, int]:
-    """The unknowns (P,) at the minimum over all vertices, near that of a sample with a Gauss-Newton matrix (P, P).
+    """Minimise over all vertices by BFGS, from the minimum of a sample and its Gauss-Newton matrix (P, P).
 
-    By gradients alone, the matrix is where BFGS begins: whether it converged, and how many steps it took.
+    Only gradients are computed. Returns the unknowns (P,), whether it converged, and the number of steps.
     """
     J3, lowest = 3 * len(model.skeleton.parents), [np.inf]
     nothing = 0.5 * target.size * (100 * np.finfo(float).eps * np.abs(target).max())**2     # rounding leaves as much

@@ -73,6 +73,7 @@ def learn(poses: Path, output: Output, shapes: Path | None = None, template: Pat
         skinning: Settings of skinning.
         mixed: Settings of a mix.
     """
+    # options that exclude each other
     if kind == "mixed" and (shapes is not None or by_sex):
         raise UsageError("--kind mixed: it learns one SCAPE model of --poses alone, without --shapes and --by-sex")
     if by_sex and (shapes is None or kind != "scape"):
@@ -82,7 +83,7 @@ def learn(poses: Path, output: Output, shapes: Path | None = None, template: Pat
     with_prior = kind in WITH_PRIOR and scape != LearnConfig.from_paper()
     if prior not in ("auto", "none") and not with_prior:
         raise UsageError(f"--prior {prior}: expected the kind {' or '.join(WITH_PRIOR)} and not --preset published")
-    # what is learned from, and what the model is to know besides
+    # bodies to learn from, and the landmarks that the model keeps
     if kind == "mixed":
         if not (poses / "set.json").exists():
             raise ValueError(f"{poses}: expected a registered set, which says whose mesh each is, found a plain folder")
@@ -94,10 +95,10 @@ def learn(poses: Path, output: Output, shapes: Path | None = None, template: Pat
     sexes = None if not by_sex or shapes is None else _read_sexes(shapes)
     marks = landmarks or poses / "landmarks.json"
     named = read_landmark_vertices(marks, body) if landmarks or marks.exists() else {}
-    # the parts, where none are given, and the model
+    # a prior where poses or people are few, the skeleton where none is given, and the model
     step = KeptSteps(space)
-    # Poses, and people, that need no prior. The skeleton of 20 poses left 11.4 mm in held-out ones, with a prior 7.6
-    # mm; that of 57 poses 6.0 mm, with a prior 6.4 mm.
+    # from 40 poses and 40 people on no prior is needed. With 20 poses the skeleton left 11.4 mm in held-out poses, with
+    # a prior 7.6 mm; with 57 poses 6.0 mm, with a prior 6.4 mm.
     enough = 40
     many = len(posed) >= enough
     if not with_prior or (prior == "auto" and many and people is not None and len(people) >= enough):
@@ -136,7 +137,7 @@ def learn(poses: Path, output: Output, shapes: Path | None = None, template: Pat
 
 
 def _about_steps(step: KeptSteps) -> list[Metric]:
-    """The seconds of every step; of one that an earlier call had begun those of what was left."""
+    """List the seconds of every step; of a step that an earlier call had begun, those of the rest."""
     begun = {name.split("/")[0] for name in step.found if "/" in name}
     return [*(Metric(f"time: {name}", "done before") for name in step.found if "/" not in name),
             *(Metric(f"time: {name}", value, "s, of what was left" if name in begun else "s")
@@ -144,7 +145,7 @@ def _about_steps(step: KeptSteps) -> list[Metric]:
 
 
 def _bring_prior(body: Mesh, prior: str, step: Step) -> TemplatePrior | None:
-    """The prior of a name in the template's triangles; None for "none", and for "auto" on what is no person."""
+    """Bring the named prior to the template's triangles; None for "none", and for "auto" where there is no person."""
     if prior == "none" or (prior == "auto" and not has_limbs(body)):
         return None
     name = BUILT_IN if prior == "auto" else prior
@@ -161,7 +162,7 @@ def _bring_prior(body: Mesh, prior: str, step: Step) -> TemplatePrior | None:
 
 
 def _about_prior(model: BodyModel) -> list[Metric]:
-    """What of a model is its prior's; no rows where it has none."""
+    """List what a model took from its prior; no rows where it has none."""
     if "prior" not in model.info:
         return []
     count, evidence = model.info["prior_people"], model.info["joint_evidence"]
@@ -174,7 +175,7 @@ def _about_prior(model: BodyModel) -> list[Metric]:
 
 
 def _read_sexes(folder: Path) -> list[str]:
-    """The sex of every person, in the order of `read_bodies`; empty where not known."""
+    """Read the sex of every person, in the order of `read_bodies`; empty where not known."""
     if (folder / "set.json").exists():
         whole = RegisteredSet.load(folder)
         first = {entry.subject: entry.sex for entry in reversed(whole.entries)}

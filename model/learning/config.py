@@ -9,28 +9,35 @@ from scanprep.ranges import Positive, Settings
 
 @dataclass(frozen=True)
 class LearnConfig(Settings):
-    """Settings of `learn_scape`.
+    """Settings of `learn_scape` and `learn_blendscape`.
 
     Attributes
     ----------
     features : {"linear", "quadratic"}
-        What Q is linear in: the twists, or also their products.
+        Q is linear in the twists, or in the twists and their products.
     regressor : {"ridge", "svr"}
-        Least squares with a penalty, or support-vector regression.
-    prunings : floats, square radians
-        Twist directions of smaller variance are not regressed on; the best is chosen by leaving poses out.
-    ridges : floats, square radians
-        Strengths of the penalty; the best is chosen by leaving poses out.
+        Ridge regression, or support-vector regression.
+    prunings : tuple of float, square radians
+        Twist directions of smaller variance are not regressed on; the best value is chosen by leaving poses out.
+    ridges : tuple of float, square radians
+        Strengths of the penalty; the best value is chosen by leaving poses out.
     smoothness : float
-        The paper's 0.001: times the mean edge length it is w_s of Eq. 5 and 8.
+        Times the mean edge length it is w_s of Eq. 5 and 8.
     refinements : int
         How often part rotations are fitted anew to the learned model and the regression is corrected by what the
         stitched surface leaves; of a mix, the largest number of rounds.
     detail : float
-        Features are joined to fewer ones as long as that changes the edges of a part by less, as a share of the mean
-        edge length; 0 joins none.
+        Features are combined into fewer as long as that changes the edges of a part by less than this share of the mean
+        edge length; 0 combines none.
     components : int
         Shape components to keep, fewer where there are fewer people.
+
+    Examples
+    --------
+    >>> LearnConfig.from_paper().prunings
+    (0.01,)
+
+    [SCAPE] Eq. 4, Eq. 5, Eq. 8
     """
 
     features: Literal["linear", "quadratic"] = "linear"
@@ -44,11 +51,11 @@ class LearnConfig(Settings):
 
     @classmethod
     def from_paper(cls) -> LearnConfig:
-        """The paper's own way: joints pruned at 0.1, linear least squares, w_s = 0.001 ρ, nothing refined.
+        """Return the paper's settings: joints pruned at 0.1, linear least squares, w_s = 0.001 ρ, no refinement.
 
-        The 0.1 has no unit in the paper. It is read as a standard deviation in radians, a variance of 0.01; the paper's
-        own poses lost a third of the parameters by it, others lose another share. Not as in the paper: 40 shape
-        components, of which it tells no number; twists by a logarithm that holds at every angle.
+        The paper's 0.1 has no unit. Here it is a standard deviation in radians, a variance of 0.01. Pruning removed a
+        third of the parameters on the paper's poses; the share differs for others. Not as in the paper: 40 shape
+        components, since it names no number, and twists by a logarithm that holds at every angle.
 
         [SCAPE] Eq. 3, Eq. 4, Eq. 5, Eq. 7, Eq. 8
         """

@@ -1,7 +1,7 @@
 """Learning from a random mix of people and poses, without one person scanned in many poses.
 
-A body is explained by `R S Q v̂`: with the people's S known, their scans tell Q; with Q known, they tell S. The two are
-found in turns [SCAPE-patent], and so are the part rotations R, which Procrustes cannot tell from the shape.
+A body is `R S Q v̂`. With S of the people known, their scans determine Q; with Q known, they determine S. The two are
+solved in turns [SCAPE-patent], and so are the part rotations R, which Procrustes cannot separate from the shape.
 """
 from __future__ import annotations
 
@@ -28,11 +28,11 @@ from .config import LearnConfig
 from .regression import Design, compress, make_design
 from .scape import Progress, ProgressShares, check_skeleton, estimate_pose_prior, fit_poses, pose_examples
 
-# What `learn_scape_mix` takes by default. `refinements` is the number of rounds: of up to six, held-out bodies were met
-# best after two. Of a mix products of twists say more than of one person: 1.46 against 1.68 mm on new people.
+# Defaults of `learn_scape_mix`. `refinements` is the number of rounds: of up to six, two gave the smallest error on
+# held-out bodies. Products of twists help more than for one person: 1.46 instead of 1.68 mm on new people.
 MIX = LearnConfig(features="quadratic", ridges=(1e-4, 3e-4, 1e-3, 3e-3, 0.01, 0.03, 0.1), detail=0.005,
                   refinements=2)
-CORRECTIONS = 2                      # of Q and of S in a round, by what the stitched model leaves
+CORRECTIONS = 2                      # how often Q and S are corrected in a round by the residual of the stitched model
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,7 +47,7 @@ class Mix:
 
 @dataclass(frozen=True, eq=False)
 class MixingState:
-    """What a round hands to the next: poses (M, J, 3), the pose space, S (P, F, 3, 3) of every person, the design."""
+    """The state between rounds: poses (M, J, 3), the pose space, S (P, F, 3, 3) of every person, the design."""
 
     poses: np.ndarray
     space: PoseSpace
@@ -73,7 +73,9 @@ def learn_scape_mix(template: Mesh, bodies: np.ndarray, subjects: Sequence[Hasha
     Parameters
     ----------
     template : Mesh
+        N vertices, F triangles.
     bodies : (M, N, 3) float, metres
+        Registered bodies.
     subjects : M labels
         Whose body each is.
     skeleton : Skeleton
@@ -102,7 +104,7 @@ def learn_scape_mix(template: Mesh, bodies: np.ndarray, subjects: Sequence[Hasha
     mix, inputs = Mix(parts, bodies, who, config), (parts, bodies, who, config)
 
     def in_turns(work: ProgressShares) -> tuple[MixingState, ShapeSpace]:
-        # rigid parts, as Procrustes places them, and everybody of the template's shape
+        # start: rigid parts by Procrustes, and the template's shape for everybody
         state = MixingState(skeleton.pose_of(skeleton.fit_rotations(template, bodies)), PoseSpace.identity(skeleton),
                             np.broadcast_to(np.eye(3, dtype=np.float32), (who.max() + 1, len(template.faces), 3, 3)),
                             None)
@@ -124,24 +126,25 @@ def learn_scape_mix(template: Mesh, bodies: np.ndarray, subjects: Sequence[Hasha
 
 
 def _next_round(mix: Mix, state: MixingState, number: int, work: ProgressShares) -> MixingState:
-    """Part rotations with the model held, then the pose model with the shapes held, then the shapes."""
+    """Fit part rotations with the model held, then the pose model with the shapes held, then the shapes."""
     S, poses = state.S, state.poses.copy()
-    # shape components that tell people apart: in each round twice as many as in the one before
+    # shapes are limited to 20 components in the first round, and twice as many in each further round
     if 20 * 2**number < len(S) - 1:
-        few = learn_shape_space(S, 20 * 2**number)
-        S = (few.mean + np.tensordot(few.betas_of(S), few.components, axes=1)).astype(np.float32)
+        limited = learn_shape_space(S, 20 * 2**number)
+        S = (limited.mean + np.tensordot(limited.betas_of(S), limited.components, axes=1)).astype(np.float32)
     for person in range(len(S) if number else 0):
-        mine = mix.who == person
-        poses[mine] = fit_poses(mix.parts.subject(state.space, S[person]), mix.bodies[mine], poses[mine],
+        own = mix.who == person
+        poses[own] = fit_poses(mix.parts.subject(state.space, S[person]), mix.bodies[own], poses[own],
                                 ProgressShares(None))
-        work.tick(float(mine.mean()))
+        work.tick(float(own.mean()))
     space, design = _learn_pose(mix, MixingState(poses, state.space, S, state.design))         # [SCAPE] Eq. 4, Eq. 5
     return MixingState(poses, space, _learn_people(mix, poses, space), design)                # [SCAPE] Eq. 8
 
 
 def _learn_pose(mix: Mix, state: MixingState) -> tuple[PoseSpace, Design]:
-    """The pose space with the shapes held, first as in the paper, then corrected on the stitched surface, as in
-    `learn_pose`. [SCAPE] Eq. 4, Eq. 5
+    """Learn the pose space with the shapes held, as in the paper, then correct it on the stitched surface.
+
+    [SCAPE] Eq. 4, Eq. 5
     """
     parts, config, poses, S = mix.parts, mix.config, state.poses, state.S.astype(np.float64)
     gradients = GradientSystem(parts.template, config.smoothness, parts.skeleton.part_of_face)
@@ -150,6 +153,7 @@ def _learn_pose(mix: Mix, state: MixingState) -> tuple[PoseSpace, Design]:
     back = np.swapaxes(inverse, -1, -2)
     space, design = state.space, state.design
     for step in range(1 + CORRECTIONS):
+        # residual edges: of the parts by themselves at first, then of the stitched bodies
         Q = space.gradients(poses)
         left = np.empty((len(poses), *parts.v_hat.shape))
         for i, (body, pose, q) in enumerate(zip(mix.bodies, poses, state.S[mix.who] @ Q, strict=True)):
@@ -162,70 +166,79 @@ def _learn_pose(mix: Mix, state: MixingState) -> tuple[PoseSpace, Design]:
         space = fit_within(design, poses, Q, mix.who)
     assert design is not None
     space = compress(space, poses, parts.template, config.detail * parts.template.mean_edge)
-    # the gauge: Q = I at zero twist; S takes over what was there
+    # S Q is unique only up to a factor: fix Q = I at zero twist, and let S take over the rest
     rest = np.linalg.inv(space.gradients(np.zeros(parts.skeleton.joints.shape)))
     return PoseSpace(space.features, tuple((rest[faces] @ a.astype(np.float64)).astype(np.float32) for faces, a in
                                            zip(space.faces_of_part, space.coefficients, strict=True))), design
 
 
 def _learn_people(mix: Mix, poses: np.ndarray, space: PoseSpace) -> np.ndarray:
-    """S (P, F, 3, 3) of every person from all of their bodies together, in float32 to halve the memory. As with Q, what
-    the stitched bodies leave is added and solved for again. [SCAPE] Eq. 8
+    """Fit S (P, F, 3, 3) of every person to all of their bodies together, in float32 to halve the memory.
+
+    As with Q, the residual of the stitched bodies is added and solved for again.
+
+    [SCAPE] Eq. 8
     """
     def side_by_side(edges: np.ndarray) -> np.ndarray:
-        """Edges (n, F, 2, 3) of several scans as those (F, 2n, 3) of one."""
+        """Arrange edges (n, F, 2, 3) of several scans as those (F, 2n, 3) of one."""
         return np.concatenate(list(edges), axis=1)
 
     parts, P = mix.parts, int(mix.who.max()) + 1
     system = GradientSystem(parts.template, mix.config.smoothness)
     S = np.empty((P, len(parts.template.faces), 3, 3), dtype=np.float32)
     for person in range(P):
-        bodies, mine = mix.bodies[mix.who == person], poses[mix.who == person]
-        Q = space.gradients(mine)
+        bodies, own = mix.bodies[mix.who == person], poses[mix.who == person]
+        Q = space.gradients(own)
         posed = side_by_side(parts.deform_edges(Q))
         solve = ShapeSolver(system, posed)
-        found = solve(side_by_side(parts.local_edges(bodies, mine)))
+        shape = solve(side_by_side(parts.local_edges(bodies, own)))
         for _ in range(CORRECTIONS):
-            left = bodies - np.stack([parts.stitch(found @ q, pose) for q, pose in zip(Q, mine, strict=True)])
-            found = solve(posed @ np.swapaxes(found, -1, -2) + side_by_side(parts.local_edges(left, mine)))
-        S[person] = found
+            left = bodies - np.stack([parts.stitch(shape @ q, pose) for q, pose in zip(Q, own, strict=True)])
+            shape = solve(posed @ np.swapaxes(shape, -1, -2) + side_by_side(parts.local_edges(left, own)))
+        S[person] = shape
     return S
 
 
 @dataclass(frozen=True, eq=False)
 class Within:
-    """The transform that makes a regression with a random effect a person an ordinary one; `who` (M,) says whose each
-    body is, 0..P-1. From every body a share of the mean over its person's bodies is taken, the larger the more there
-    are. What people have of their own weighs little then; where each has one body only, all are weighed alike.
+    """The transform that turns a regression with a random effect for each person into an ordinary one.
+
+    `who` (M,) is the person of each body, 0..P-1. A share of the mean over a person's bodies is subtracted from each;
+    it is the larger the more bodies there are. So a person's own shape has little weight. Where each person has only
+    one body, all have equal weight.
     """
 
     who: np.ndarray
 
     def __call__(self, values: np.ndarray) -> np.ndarray:
-        """Values (M, ...) without that share."""
+        """Subtract that share from values (M, ...)."""
         out = np.array(values, dtype=np.float64)
         for person in range(int(self.who.max()) + 1):
-            mine = self.who == person
-            # 30: variance between people over that within, of what regression does not explain
-            out[mine] -= (1 - 1 / np.sqrt(1 + 30.0 * mine.sum())) * out[mine].mean(axis=0)
+            own = self.who == person
+            # 30: ratio of the variances between and within people that the regression does not explain
+            out[own] -= (1 - 1 / np.sqrt(1 + 30.0 * own.sum())) * out[own].mean(axis=0)
         return out
 
     def without_the_person(self, X: np.ndarray, operator: np.ndarray, target: np.ndarray) -> np.ndarray:
-        """Residuals (M, n) of transformed targets, every person predicted from the others, in closed form, with
-        transformed features X (M, k) and the operator (k, M) from targets to coefficients.
+        """Compute leave-one-person-out residuals (M, n) in closed form.
+
+        Features X (M, k) and targets (M, n) are transformed; `operator` (k, M) maps targets to coefficients.
         """
         hat = X @ operator
         left = target - hat @ target
         for person in range(int(self.who.max()) + 1):
-            mine = np.flatnonzero(self.who == person)
-            left[mine] = np.linalg.solve(np.eye(len(mine)) * (1 + 1e-9) - hat[np.ix_(mine, mine)], left[mine])
+            own = np.flatnonzero(self.who == person)
+            left[own] = np.linalg.solve(np.eye(len(own)) * (1 + 1e-9) - hat[np.ix_(own, own)], left[own])
         return left
 
 
 def choose_within(template: Mesh, skeleton: Skeleton, poses: np.ndarray, Q: np.ndarray, who: np.ndarray,
                   config: LearnConfig) -> Design:
-    """The pruning and penalty that predict the edges of left-out people best, of poses (M, J, 3), Q (M, F, 3, 3), and
-    whose body each is (M,). [SCAPE] Eq. 4
+    """Choose the pruning and penalty that predict the edges of left-out people best.
+
+    From poses (M, J, 3), Q (M, F, 3, 3), and the person of each body, `who` (M,).
+
+    [SCAPE] Eq. 4
     """
     designs = (make_design(template, skeleton, poses, config, pruning, ridge)
                for pruning, ridge in product(config.prunings, config.ridges))
@@ -234,7 +247,8 @@ def choose_within(template: Mesh, skeleton: Skeleton, poses: np.ndarray, Q: np.n
 
 
 def fit_within(design: Design, poses: np.ndarray, Q: np.ndarray, who: np.ndarray) -> PoseSpace:
-    """Q as a function of the features, as `Design.fit`, were it not for what each person has of their own.
+    """Fit Q as a function of the features, as `Design.fit`, with a random effect for each person.
+
     [SCAPE] Eq. 4
     """
     within = Within(who)
@@ -244,14 +258,14 @@ def fit_within(design: Design, poses: np.ndarray, Q: np.ndarray, who: np.ndarray
 
 
 def _operator(X: np.ndarray, ridge: float) -> np.ndarray:
-    """(k, M) from targets to coefficients of features (M, k), the first of which is the constant and free."""
+    """Compute the ridge operator (k, M) from targets to coefficients; the first feature, the constant, is free."""
     penalty = np.full(X.shape[1], len(X) * ridge + 1e-12)
     penalty[0] = 1e-12
     return np.linalg.solve(X.T @ X + np.diag(penalty), X.T)
 
 
 def _leave_out_error(design: Design, poses: np.ndarray, Q: np.ndarray, who: np.ndarray) -> float:
-    """Root mean square error in metres of the edges of left-out people, apart from what is their own."""
+    """Compute the RMS error, metres, of the edges of left-out people, apart from each person's random effect."""
     within = Within(who)
     delta, total = within(design.features.evaluate(poses)), 0.0
     v_hat = np.swapaxes(design.template.corners[:, 1:] - design.template.corners[:, :1], -1, -2)
@@ -263,7 +277,7 @@ def _leave_out_error(design: Design, poses: np.ndarray, Q: np.ndarray, who: np.n
 
 
 def number_people(subjects: Sequence[Hashable], count: int) -> np.ndarray:
-    """(M,) numbers of the people in order of appearance, or ValueError."""
+    """Number the people in order of appearance, (M,); ValueError for too few."""
     if len(subjects) != count:
         raise ValueError(f"subjects: expected {count} labels, one a body, got {len(subjects)}")
     order = {label: i for i, label in enumerate(dict.fromkeys(subjects))}

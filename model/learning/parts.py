@@ -1,4 +1,4 @@
-"""How many parts: as many as predict poses that were left out."""
+"""Choice of the number of parts by the error of left-out poses."""
 from __future__ import annotations
 
 from dataclasses import dataclass
@@ -19,14 +19,14 @@ from ..human_poses import is_person
 from .config import LearnConfig
 from .scape import Progress, ProgressShares, learn_pose
 
-QUICK = LearnConfig(prunings=(0.01,), ridges=(1e-3, 1e-2), refinements=1)
-MORE, TRIES = 4, 3                   # parts more each time, and the largest number of times
-VERTICES = 2500                      # of the coarse copies on which the models are learned that are compared
+QUICK = LearnConfig(prunings=(0.01,), ridges=(1e-3, 1e-2), refinements=1)    # models that are only compared
+MORE, TRIES = 4, 3                   # parts added at each try, and most tries
+VERTICES = 2500                      # of the coarse bodies on which models are compared: a model in seconds
 
 
 @dataclass(frozen=True, eq=False)
 class ChosenSkeleton:
-    """A skeleton, and the errors of poses that were left out, metres, by the number of parts."""
+    """A skeleton, and the errors of left-out poses, metres, by the number of parts."""
 
     skeleton: Skeleton
     errors: dict[int, float]
@@ -35,18 +35,19 @@ class ChosenSkeleton:
 @one_thread()
 def choose_skeleton(template: Mesh, poses: np.ndarray, progress: Progress | None = None, step: Step = run_uncached,
                     known: np.ndarray | None = None) -> ChosenSkeleton:
-    """A skeleton with as many parts as help to predict poses that were left out.
+    """Find a skeleton with as many parts as help to predict left-out poses.
 
-    The search for rigid parts stops where surfaces no longer meet in a joint. A trunk or a shoulder bends without
-    one, and a model of it gains from more parts than that: so finer skeletons are sought from the same restarts, a
-    model is learned with each on a coarse copy of the bodies, and they are kept while the error of left-out poses
-    falls, and while a person's parts can be named.
+    The search for rigid parts stops where surfaces no longer meet in a joint. But trunk and shoulders bend without
+    joints, and need more parts. So finer skeletons are found from the same restarts, and a model is learned with each
+    on a coarse copy of the bodies. They are kept while the error of left-out poses falls, and while a person's parts
+    can be named.
 
     Parameters
     ----------
     template : Mesh
+        N vertices.
     poses : (M, N, 3) float, metres
-        Of one person.
+        Bodies of one person.
     progress : callable, optional
         Called with the skeletons done and their largest number.
     step : callable, optional
@@ -88,9 +89,9 @@ def choose_skeleton(template: Mesh, poses: np.ndarray, progress: Progress | None
         finer = tried(wanted)
         tell(settings.restarts + done, whole)
         if finer is None or (is_person(best) and not is_person(finer[0])):
-            break                       # the pose prior of people goes by the names of parts, which are lost
+            break                       # the pose prior of people needs the names of parts, which would be lost
         errors[wanted] = finer[1]
-        # share of the left-out error that more parts must save to be kept
+        # more parts must lower the left-out error by 3%, since they cost time and names
         if errors[wanted] > (1 - 0.03) * errors[len(best.parents)]:
             break
         best = finer[0]
@@ -100,13 +101,13 @@ def choose_skeleton(template: Mesh, poses: np.ndarray, progress: Progress | None
 
 def _try_parts(finder: SkeletonFinder, parts: int | None, coarse: Mesh, poses: np.ndarray, known: np.ndarray | None
                ) -> tuple[Skeleton, float] | None:
-    """A skeleton and its error on coarse bodies (M, n, 3), with those of a prior (K, n, 3).
+    """Find a skeleton with `parts` parts and its error on coarse bodies (M, n, 3), with those of a prior (K, n, 3).
 
     None where there is no tree of so many parts, or parts are too small to compare.
     """
     try:
-        found = finder.skeleton(finder.runs[0] if parts is None else finder.first, parts)[0]
-        return found, _leave_out_error(poses, coarse_skeleton(found, finder.template, coarse), coarse, known)
+        skeleton = finder.skeleton(finder.runs[0] if parts is None else finder.first, parts)[0]
+        return skeleton, _leave_out_error(poses, coarse_skeleton(skeleton, finder.template, coarse), coarse, known)
     except ValueError:
         if parts is None:
             raise
@@ -114,7 +115,7 @@ def _try_parts(finder: SkeletonFinder, parts: int | None, coarse: Mesh, poses: n
 
 
 def coarse_copy(template: Mesh, count: int) -> tuple[np.ndarray, Mesh]:
-    """About `count` of the template's vertices (n,), and triangles over them alone."""
+    """Choose about `count` of the template's vertices (n,), and build triangles over them."""
     if len(template.vertices) <= count:
         return np.arange(len(template.vertices)), template
     small = decimate(template, 2 * count)
@@ -126,7 +127,7 @@ def coarse_copy(template: Mesh, count: int) -> tuple[np.ndarray, Mesh]:
 
 
 def coarse_skeleton(skeleton: Skeleton, template: Mesh, coarse: Mesh) -> Skeleton:
-    """The skeleton on a coarse copy: every triangle has the part of the nearest one."""
+    """Transfer the skeleton to a coarse copy: every triangle gets the part of the nearest one."""
     near = cKDTree(template.corners.mean(axis=1)).query(coarse.corners.mean(axis=1))[1]
     part, joints = skeleton.part_of_face[near], skeleton.joints.copy()
     lost = np.setdiff1d(np.arange(len(skeleton.parents)), part)
@@ -138,7 +139,7 @@ def coarse_skeleton(skeleton: Skeleton, template: Mesh, coarse: Mesh) -> Skeleto
 
 
 def _leave_out_error(poses: np.ndarray, skeleton: Skeleton, coarse: Mesh, known: np.ndarray | None) -> float:
-    """Mean distance in metres of the vertices of left-out poses (M, n, 3) of the coarse bodies."""
+    """Compute the mean vertex error, metres, of left-out poses (M, n, 3) of the coarse bodies."""
     parts, prior = BlendedTemplate(coarse, skeleton, rigid_weights(skeleton)), None
     if known is not None:
         prior = learn_pose(parts, np.concatenate([coarse.vertices[None], known]), QUICK, ProgressShares(None))

@@ -1,12 +1,12 @@
-"""What a known model says of a template's person, of whom there are few scans.
+"""A known model as the prior of a new one, for a template's person with few scans.
 
-1. The model's mesh is laid on the template. Laid, it is a body of the model, with all detail of the template's person.
-2. That body is moved to the model's example poses; the template's vertices ride on its triangles. These are bodies of
-   the template's person in poses that nobody scanned.
-3. In the template's own pose the mean person of the model, and one standard deviation along each of its betas, carry
-   the template's vertices in the same way. These are other people in the template's triangles.
+1. The model's mesh is laid on the template. It is then a body of the model with all detail of the template's person.
+2. That body is posed in the model's example poses and carries the template's vertices. So there are bodies of the
+   template's person in poses that nobody scanned.
+3. In the template's own pose, the model's mean person, and one standard deviation along each of its betas, carry the
+   template's vertices too. So there are other people in the template's triangles.
 
-`learn_scape` learns from both as if they had been scanned, and leans on them as far as the scans leave it open.
+`learn_scape` uses both as a prior, where the scans determine too little.
 """
 from __future__ import annotations
 
@@ -24,8 +24,8 @@ from ..posing.transfer import own_body
 from ..priors import sample_poses
 from ..resolution.transfer import SurfaceCarrier, transfer_skeleton
 
-# Example poses of the model that are used, evenly over all. With 50 the skeleton of 8 poses had parts that nobody can
-# name; held-out poses were 8.5 mm off with 50, and 9.1 mm with 25.
+# Number of the model's example poses that are used, evenly over all. With 50, the skeleton of 8 poses had parts without
+# a name, though held-out poses were 8.5 mm off, and 9.1 mm with 25.
 EXAMPLES = 25
 
 
@@ -57,8 +57,9 @@ def bring_prior(model: BodyModel, template: Mesh, progress: Callable[[int, int],
     Parameters
     ----------
     model : BodyModel
+        The known model.
     template : Mesh
-        Of what the model is of, in a pose that the model's search finds.
+        Of the same kind of body as the model, in a pose that the model's search finds.
     progress : callable, optional
         Called as progress(done, total).
 
@@ -69,7 +70,7 @@ def bring_prior(model: BodyModel, template: Mesh, progress: Callable[[int, int],
     Raises
     ------
     ModelMismatchError
-        A model that does not come to lie on the template.
+        The model does not fit the template.
 
     Examples
     --------
@@ -82,7 +83,7 @@ def bring_prior(model: BodyModel, template: Mesh, progress: Callable[[int, int],
     laid = lay_model(model, template, progress)
     own = own_body(model, laid.vertices)
     ride = SurfaceCarrier(laid.with_vertices(own.vertices), template)
-    # the person as the model moves it, in poses that it was learned from, of which some models keep none
+    # the person in the model's example poses; models without examples draw from their prior
     known = model.pose_examples if len(model.pose_examples) else sample_poses(model, EXAMPLES, np.random.default_rng(0))
     examples = known[np.unique(np.linspace(0, len(known) - 1, EXAMPLES).astype(int))]
     moved = np.stack([ride.positions(own.subject.vertices(pose)) for pose in examples])
@@ -94,7 +95,7 @@ def bring_prior(model: BodyModel, template: Mesh, progress: Callable[[int, int],
 
 
 def _skeleton_on(model: BodyModel, laid: Mesh, template: Mesh) -> Skeleton:
-    """The model's skeleton on a template on which its mesh was laid."""
+    """Transfer the model's skeleton to a template on which its mesh was laid."""
     on_laid = replace(model.skeleton, joints=model.joint_regressor @ laid.vertices)
     skeleton = transfer_skeleton(on_laid, laid, template)
     joints = skeleton.joints.copy()

@@ -1,4 +1,4 @@
-"""Regressing Q on the joint twists: what it may depend on, and how strongly, is chosen inside the training set."""
+"""Regression of Q on the joint twists; features and penalty are chosen by left-out poses of the training set."""
 from __future__ import annotations
 
 from collections.abc import Callable
@@ -17,11 +17,11 @@ from .config import LearnConfig
 
 @dataclass(frozen=True, eq=False)
 class Design:
-    """What each triangle regresses on, chosen once; fitting it again to other poses and Q is cheap.
+    """The features and penalty of the regression, chosen once; fitting them again to other poses and Q is cheap.
 
-    The features are those before they are made few: every part has all the numbers of all its joints. A group is a
-    part, its features (n,), and the triangles (f,) that regress on the same two joints. Of the errors of left-out
-    poses, metres. With a `prior` the penalty draws Q towards what that says, instead of towards a constant.
+    The features are those before `compress`: every part has all features of all its joints. A group is a part, its
+    features (n,), and the triangles (f,) that depend on the same two joints. `left_out_error`, metres, is that of left-
+    out poses. With a `prior` the penalty draws Q towards the prior instead of towards a constant.
     """
 
     template: Mesh
@@ -34,20 +34,21 @@ class Design:
     prior: PoseSpace | None = None
 
     def fit(self, poses: np.ndarray, Q: np.ndarray) -> PoseSpace:
-        """Q (M, F, 3, 3), seen at poses (M, J, 3), as a function of the features. [SCAPE] Eq. 4"""
+        """Fit Q (M, F, 3, 3), observed at poses (M, J, 3), as a function of the features. [SCAPE] Eq. 4"""
         seen = self.prepare(poses)
         return seen.fit(seen.sums(Q))
 
     def prepare(self, poses: np.ndarray) -> SeenPoses:
-        """The poses (M, J, 3) as least squares sees them; support vectors see every pose by itself."""
+        """Prepare least squares for poses (M, J, 3); support vectors keep every pose by itself."""
         delta, features = self.features.evaluate(poses), self.features
         bases = [np.eye(len(delta)) if self.regressor == "svr" else np.linalg.qr(delta[:, features.of_part(p)])[0]
                  for p in range(len(features.starts))]
         return SeenPoses(self, poses, delta, bases)
 
     def space(self, solve: Callable[[np.ndarray, np.ndarray], np.ndarray]) -> PoseSpace:
-        """The pose space with the coefficients (n, 9f) that `solve` finds for each group, from its features (n,), the
-        constant of the part first, and its faces (f,).
+        """Build the pose space from the coefficients (n, 9f) that `solve` returns for each group.
+
+        `solve` gets the features (n,) of the group, the constant of the part first, and its faces (f,).
         """
         features, each = self.features, faces_of_part(self.features.skeleton)
         coefficients = tuple(np.zeros((features.of_part(p).stop - features.of_part(p).start, len(f), 3, 3),
@@ -64,11 +65,10 @@ class Design:
 
 @dataclass(frozen=True, eq=False)
 class SeenPoses:
-    """Poses (M, J, 3) with their features (M, A), and for every part an orthonormal basis (M, r) of what its features
-    are in the poses.
+    """Poses (M, J, 3), their features (M, A), and for every part an orthonormal basis (M, r) of its features' values.
 
-    Least squares asks nothing more of Q than its sums over the poses along that basis, which are far fewer than poses.
-    Where Q is itself a linear function of edges, those of the edges are enough.
+    Least squares needs only the sums of Q over the poses along that basis, which are far fewer than the poses. Where Q
+    is itself linear in edges, the sums of the edges are enough.
     """
 
     design: Design
@@ -77,7 +77,7 @@ class SeenPoses:
     bases: list[np.ndarray]
 
     def sums(self, values: np.ndarray) -> np.ndarray:
-        """Sums (r, F, ...) of values (M, F, ...) along the basis of the part of every triangle."""
+        """Project values (M, F, ...) onto the basis of each triangle's part: sums (r, F, ...)."""
         out = np.zeros((max(basis.shape[1] for basis in self.bases), *values.shape[1:]))
         for basis, faces in zip(self.bases, faces_of_part(self.design.features.skeleton), strict=True):
             along = basis.T @ values[:, faces].reshape(len(values), -1)
@@ -85,7 +85,7 @@ class SeenPoses:
         return out
 
     def of_space(self, space: PoseSpace) -> np.ndarray:
-        """The sums (r, F, 3, 3) of what a pose space says of the poses."""
+        """Project the Q of a pose space at the poses: sums (r, F, 3, 3)."""
         delta = space.features.evaluate(self.poses)
         out = np.zeros((max(basis.shape[1] for basis in self.bases), len(self.design.template.faces), 3, 3))
         for p, (basis, faces) in enumerate(zip(self.bases, space.faces_of_part, strict=True)):
@@ -94,13 +94,14 @@ class SeenPoses:
         return out
 
     def fit(self, sums: np.ndarray) -> PoseSpace:
-        """Q as a function of the features, from its sums (r, F, 3, 3). [SCAPE] Eq. 4"""
+        """Fit Q as a function of the features, from its sums (r, F, 3, 3). [SCAPE] Eq. 4"""
         design, M = self.design, len(self.poses)
-        if design.prior is not None:            # what the prior leaves is regressed, and added to what it says
+        if design.prior is not None:            # the residual of the prior is regressed, then the prior is added
             sums = sums - self.of_space(design.prior)
         v_hat = design.template.corners[:, 1:] - design.template.corners[:, :1]
 
         def solve(used: np.ndarray, faces: np.ndarray) -> np.ndarray:
+            # centred features and mean of Q, both in terms of the basis; then slopes, and the constant from the mean
             basis = self.bases[design.features.part[used[0]]]
             ones, X, Q = basis.sum(axis=0), basis.T @ self.delta[:, used[1:]], sums[:basis.shape[1], faces]
             centre, flat = ones @ X / M, Q.reshape(len(Q), -1)
@@ -120,9 +121,12 @@ Judge = Callable[[Design], float]
 
 def choose_design(template: Mesh, skeleton: Skeleton, poses: np.ndarray, config: LearnConfig, judge: Judge,
                   start: Design | None = None, prior: PoseSpace | None = None) -> Design:
-    """The features, pruning and penalty that predict left-out poses of (M, J, 3) best, one sought after the other. The
-    judge gives the error of a design in metres. The choices begin with those of `start`, or with the middle of what
-    there is. All designs have the `prior`. [SCAPE] Eq. 4
+    """Choose pruning and penalty, one after the other, that predict left-out poses of (M, J, 3) best.
+
+    `judge` returns the error of a design in metres. The search begins with the choices of `start`, or with the middle
+    ones. All designs have the `prior`.
+
+    [SCAPE] Eq. 4
     """
     choices = {"pruning": config.prunings, "ridge": config.ridges}
     at = {name: values[len(values) // 2] for name, values in choices.items()}
@@ -135,16 +139,14 @@ def choose_design(template: Mesh, skeleton: Skeleton, poses: np.ndarray, config:
     best = tried()
     for name, values in choices.items():
         others = [tried(**{name: value}) for value in values if value != at[name]]
-        best = min([best, *others], key=attrgetter("left_out_error"))          # of equals the one that stands already
+        best = min([best, *others], key=attrgetter("left_out_error"))          # among equals the present one stays
         at[name] = getattr(best, name)
     return best
 
 
 def make_design(template: Mesh, skeleton: Skeleton, poses: np.ndarray, config: LearnConfig, pruning: float,
                 ridge: float) -> Design:
-    """One design: for every part a constant, the twist directions of its joints that vary in the poses, and where they
-    are asked for the products of these.
-    """
+    """Build a design: for every part a constant, the varying twist directions of its joints, and maybe products."""
     kept = principal_directions(poses, pruning)
     features = linear_features(skeleton, kept) if config.features == "linear" else part_features(
         skeleton, QuadraticLift(), [QuadraticLift.of_directions(each) for each in kept])
@@ -152,19 +154,19 @@ def make_design(template: Mesh, skeleton: Skeleton, poses: np.ndarray, config: L
 
 
 def _groups(template: Mesh, features: PoseFeatures) -> list[tuple[int, np.ndarray, np.ndarray]]:
-    """Triangles of one part that regress on the same joints: (part, features without the constant, faces)."""
+    """Group the triangles of each part that depend on the same joints: (part, features without constant, faces)."""
     near = nearest_joints(template, features.skeleton)
     groups = []
     for p, faces in enumerate(faces_of_part(features.skeleton)):
         kinds, which = np.unique(near[faces], axis=0, return_inverse=True)
-        mine = np.arange(features.count)[features.of_part(p)][1:]
+        of_part = np.arange(features.count)[features.of_part(p)][1:]
         for g, joints in enumerate(kinds):
-            groups.append((p, mine[~(features.uses[mine] & ~joints).any(axis=1)], faces[which.ravel() == g]))
+            groups.append((p, of_part[~(features.uses[of_part] & ~joints).any(axis=1)], faces[which.ravel() == g]))
     return groups
 
 
 def ridge_operator(centred: np.ndarray, penalty: float) -> np.ndarray:
-    """(n, M) matrix that gives the slopes of a ridge regression on centred features (M, n)."""
+    """Compute the matrix (n, M) that gives the slopes of a ridge regression on centred features (M, n)."""
     M, n = centred.shape
     if n <= M:
         return np.linalg.solve(centred.T @ centred + (penalty + 1e-12) * np.eye(n), centred.T)
@@ -172,8 +174,9 @@ def ridge_operator(centred: np.ndarray, penalty: float) -> np.ndarray:
 
 
 def _leave_out_operator(design: Design, delta: np.ndarray, used: np.ndarray) -> np.ndarray:
-    """(M, M) from what is regressed on features `used` of the poses' (M, A) to how far each pose is off where ridge
-    regression on the others predicts it, in closed form.
+    """Compute the matrix (M, M) that maps targets to their leave-one-out residuals in ridge regression, in closed form.
+
+    The regression is on the features `used` of `delta` (M, A).
     """
     X = delta[:, used] - delta[:, used].mean(axis=0)
     hat = X @ ridge_operator(X, len(X) * design.ridge) + 1 / len(X)
@@ -181,7 +184,7 @@ def _leave_out_operator(design: Design, delta: np.ndarray, used: np.ndarray) -> 
 
 
 def predict_left_out(design: Design, poses: np.ndarray, Q: np.ndarray) -> np.ndarray:
-    """Q (M, F, 3, 3) of every pose as ridge regression on the other poses predicts it."""
+    """Predict Q (M, F, 3, 3) of every pose by ridge regression on the other poses."""
     delta, out = design.features.evaluate(poses), np.empty_like(Q)
     known = 0.0 if design.prior is None else design.prior.gradients(poses)
     Q = Q - known
@@ -193,11 +196,10 @@ def predict_left_out(design: Design, poses: np.ndarray, Q: np.ndarray) -> np.nda
 
 
 def by_edges(template: Mesh, poses: np.ndarray, Q: np.ndarray) -> Judge:
-    """The root mean square error of the edges of left-out poses, metres, of poses (M, J, 3) and Q (M, F, 3, 3).
+    """Make a judge of designs: the RMS error, metres, of the edges of left-out poses (M, J, 3) with Q (M, F, 3, 3).
 
-    For designs with a prior Q is what the prior leaves of it.
-
-    Off by L T, the edges T (M, 6f) of a group of triangles count as trace(L T Tᵀ Lᵀ): their products are summed once.
+    For designs with a prior, Q is the residual of the prior. The edges T (M, 6f) of a group of triangles have residuals
+    L T, so the squared error is trace(L T Tᵀ Lᵀ): the products T Tᵀ are computed once.
     """
     v_hat, products = np.swapaxes(template.corners[:, 1:] - template.corners[:, :1], -1, -2), list[np.ndarray]()
 
@@ -217,8 +219,11 @@ def by_edges(template: Mesh, poses: np.ndarray, Q: np.ndarray) -> Judge:
 
 def _support_vectors(X: np.ndarray, Q: np.ndarray, v_hat: np.ndarray, ridge: float
                      ) -> tuple[np.ndarray, np.ndarray]:
-    """Slopes (n, 9f) and means (9f,) of support-vector regression of Q (M, f, 3, 3) on centred features (M, n). Q is
-    first written in its principal components, weighted as the edges see them: few numbers carry all that varies.
+    """Compute slopes (n, 9f) and means (9f,) of a support-vector regression of Q (M, f, 3, 3) on features (M, n).
+
+    The features are centred. Q is first expressed in its principal components, weighted by edge length, since few
+    components carry all variation.
+
     [SCAPE-patent] §0047
     """
     from sklearn.svm import SVR
@@ -226,6 +231,7 @@ def _support_vectors(X: np.ndarray, Q: np.ndarray, v_hat: np.ndarray, ridge: flo
     M = len(X)
     mean = Q.mean(axis=0)
     weight = np.sqrt((v_hat**2).sum(axis=(-1, -2)) / 2)[:, None, None]
+    # principal components of Q, each scaled to unit variance
     scores, values, modes = np.linalg.svd(((Q - mean) * weight).reshape(M, -1), full_matrices=False)
     good = values > 1e-3 * max(values[0], 1e-30)
     unit = values[good] / np.sqrt(M)
@@ -233,7 +239,7 @@ def _support_vectors(X: np.ndarray, Q: np.ndarray, v_hat: np.ndarray, ridge: flo
     size = np.sqrt(modes.shape[1])
     slopes, offsets = np.zeros((X.shape[1], len(unit))), np.zeros(len(unit))
     for c in range(len(unit)):
-        # metres: smaller errors of an edge cost nothing to support-vector regression
+        # errors of an edge below 0.2 mm cost nothing
         machine = SVR(kernel="linear", C=1 / max(M * ridge, 1e-12), epsilon=min(2e-4 * size / unit[c], 0.5))
         machine.fit(X, normal[:, c])
         slopes[:, c], offsets[c] = machine.coef_[0], machine.intercept_[0]
@@ -243,19 +249,22 @@ def _support_vectors(X: np.ndarray, Q: np.ndarray, v_hat: np.ndarray, ridge: flo
 
 
 def compress(space: PoseSpace, poses: np.ndarray, template: Mesh, tolerance: float) -> PoseSpace:
-    """The pose space with those mixtures of its features alone that matter for the edges in the poses (M, J, 3) seen:
-    the fast path pays for features one by one. In each part an edge may change by the tolerance, metres RMS.
+    """Combine the features of a pose space into the few mixtures that matter for the edges in poses (M, J, 3).
+
+    The time of the fast path grows with the number of features. In each part edges may change by `tolerance`, metres
+    RMS.
     """
     features, delta = space.features, space.features.evaluate(poses)
     v_hat = np.swapaxes(template.corners[:, 1:] - template.corners[:, :1], -1, -2)
     part, mixes, coefficients = [], [], []
     for p, faces in enumerate(space.faces_of_part):
-        mine = features.of_part(p)
+        of_part = features.of_part(p)
         a = space.coefficients[p].astype(np.float64)
-        X = delta[:, mine][:, 1:]
+        X = delta[:, of_part][:, 1:]
         centre = X.mean(axis=0)
         scale, axes = _principal(X - centre)                        # X - centre = U diag(scale) axesᵀ
         moved = (a[1:] @ v_hat[faces]).reshape(len(a) - 1, 6 * len(faces))
+        # r mixtures of the features keep all but `tolerance` of the motion of the edges
         U, s, _ = np.linalg.svd((scale[:, None] * (axes.T @ moved)), full_matrices=False)
         left = np.sqrt(np.maximum(np.cumsum((s**2)[::-1])[::-1], 0) / (len(poses) * 2 * len(faces)))
         r = int((left > tolerance).sum())
@@ -264,7 +273,7 @@ def compress(space: PoseSpace, poses: np.ndarray, template: Mesh, tolerance: flo
         kept = np.tensordot(back, a[1:], axes=1)
         constant = a[0] + np.tensordot(centre, a[1:], axes=1) - np.tensordot(centre @ W, kept, axes=1)
         part += [p] * (1 + r)
-        mixes.append(np.concatenate([np.zeros((*features.mix.shape[:2], 1)), features.mix[..., mine][..., 1:] @ W],
+        mixes.append(np.concatenate([np.zeros((*features.mix.shape[:2], 1)), features.mix[..., of_part][..., 1:] @ W],
                                     axis=-1))
         coefficients.append(np.concatenate([constant[None], kept]).astype(np.float32))
     fewer = PoseFeatures(features.skeleton, features.lift, np.array(part), np.concatenate(mixes, axis=-1))
@@ -272,7 +281,7 @@ def compress(space: PoseSpace, poses: np.ndarray, template: Mesh, tolerance: flo
 
 
 def _principal(X: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Scales (k,) and axes (n, k) of centred features (M, n), without those in which nothing varies."""
+    """Compute scales (k,) and principal axes (n, k) of centred features (M, n), without directions of no variance."""
     _, s, Vt = np.linalg.svd(X, full_matrices=False)
     good = s > 1e-9 * max(s.max(initial=0.0), 1e-9)
     return s[good], Vt[good].T

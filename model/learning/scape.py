@@ -37,28 +37,28 @@ from .prior import TemplatePrior
 from .regression import Design, by_edges, choose_design, compress, predict_left_out
 
 T = TypeVar("T")
-POSES = 2 / 3                        # of the time of learning, where there are people as well
-# The pose space of a prior's own bodies: refined once it was 0.3 mm better on held-out poses, for three times the time.
+POSES = 2 / 3                        # share of the poses in the time of learning; people take the rest
+# settings for the pose space of a prior's bodies: a refinement gains 0.3 mm on held-out poses, in three times the time
 PRIOR = LearnConfig(prunings=(0.01,), ridges=(1e-3,), refinements=0)
-WORTH = 10.0                         # people that the people of a prior count as
+WORTH = 10.0                         # the people of a prior count as so many scanned people
 
 
 class ProgressShares:
-    """Steps of some work, each a share of the whole, of which progress is told in thousandths."""
+    """Nested steps of work, each a share of the whole; progress is reported in thousandths."""
 
     def __init__(self, progress: Progress | None, step: Step = run_uncached) -> None:
         self._progress, self._step, self._part, self._done = progress, step, 1.0, [0.0]
 
     def tick(self, share: float) -> None:
-        """So much of this work is done."""
+        """Report that a share of this work is done."""
         self._done[0] += share * self._part
         if self._progress:
             self._progress(round(1000 * self._done[0]), 1000)
 
     def step(self, name: str, inputs: Any, share: float, make: Callable[[ProgressShares], T]) -> T:
-        """What `make` returns, or returned before for the same inputs; it is a share of this work either way.
+        """Return what `make` returns, or returned before for the same inputs; either way a share of this work is done.
 
-        `make` gets the work of its own steps, which are forgotten once it is done.
+        `make` gets the object for its own steps, whose results are dropped once it is done.
         """
         inner, end = copy(self), self._done[0] + share * self._part
         inner._step, inner._part = substeps(self._step, name), share * self._part
@@ -73,7 +73,7 @@ def learn_scape(template: Mesh, poses: np.ndarray, shapes: np.ndarray | None, sk
                 prior: TemplatePrior | None = None) -> ScapeModel:
     """Learn a body model from one person in many poses and many people in about one pose.
 
-    With a `prior` the model is the known one, adapted: what the scans do not show is as there.
+    With a `prior`, the known model is adapted: it decides what the scans do not show.
 
     Parameters
     ----------
@@ -82,26 +82,46 @@ def learn_scape(template: Mesh, poses: np.ndarray, shapes: np.ndarray | None, sk
     poses : (M, N, 3) float, metres
         The template's person in M poses, at least two; with a prior one is enough.
     shapes : (S, N, 3) float, metres, or None
-        Other people; with None the model is of the template's own body alone, or of the people of the prior.
+        Other people. Without them the model is of the template's own body alone, or of the people of the prior.
     skeleton : Skeleton
-        For few poses that of the prior.
+        On the template; for few poses take that of the prior.
     config : LearnConfig, optional
+        Settings.
     progress : callable, optional
-        Called with the work done and the whole.
+        Called as progress(done, total).
     step : callable, optional
-        Keeps what was worked out on the way, as `scanprep.batch.room.Step`.
+        Keeps intermediate results, as `scanprep.batch.room.Step`.
     prior : TemplatePrior, optional
-        Of `bring_prior`.
+        A known model brought to the template, see `bring_prior`.
 
     Returns
     -------
     ScapeModel
-        With a prior `info["joint_evidence"]` says how much of each joint's movement is of the scans, from 0 to 1.
+        With a prior, `info["joint_evidence"]` is the share of each joint's movement that is from the scans.
 
     Raises
     ------
     ValueError
-        Too few poses, vertices of another count or not finite, a skeleton of another template.
+        Too few poses, another number of vertices, vertices that are not finite, a skeleton of another template.
+
+    Examples
+    --------
+    A bar with one joint in the middle, learned from three poses:
+
+    >>> from scanprep import Mesh, Skeleton
+    >>> from scanprep.geometry import rotations
+    >>> ring = 0.1 * np.array([[1.0, 0], [0, 1], [-1, 0], [0, -1]])
+    >>> bar = np.array([[x, y, 0.1 * k] for k in range(11) for x, y in ring])
+    >>> sides = [[4 * k + i, 4 * k + (i + 1) % 4, 4 * k + 4 + i] for k in range(10) for i in range(4)]
+    >>> sides += [[b, 4 * (b // 4) + 4 + b % 4, c] for _, b, c in sides]
+    >>> template = Mesh(bar, sides + [[0, 2, 1], [0, 3, 2], [40, 41, 42], [40, 42, 43]])
+    >>> part = (template.corners[:, :, 2].mean(axis=1) > 0.5).astype(int)
+    >>> skeleton = Skeleton(part, [-1, 0], [[0, 0, 0], [0, 0, 0.5]]).with_root_centred(template)
+    >>> upper = (bar[:, 2] > 0.5)[:, None]
+    >>> bend = [rotations.exp(np.array([angle, 0, 0])) for angle in (0.0, 0.3, 0.6)]
+    >>> poses = np.stack([np.where(upper, (bar - [0, 0, 0.5]) @ R.T + [0, 0, 0.5], bar) for R in bend])
+    >>> learn_scape(template, poses, None, skeleton, LearnConfig(refinements=0)).n_betas
+    0
 
     [SCAPE] Eq. 4, Eq. 5, Eq. 7, Eq. 8
     """
@@ -116,23 +136,38 @@ def learn_blendscape(template: Mesh, poses: np.ndarray, shapes: np.ndarray | Non
                      prior: TemplatePrior | None = None) -> BlendScapeModel:
     """Learn a body model whose rotations blend across the borders of parts.
 
-    All is as in `learn_scape`, with `R` a mixture of rotations for triangles near a border. A mixture is no rotation;
-    what it shrinks, Q learns to undo.
+    All is as in `learn_scape`, except that `R` is a blend of rotations for triangles near a border. A blend shrinks
+    triangles, and Q learns to undo that.
 
     Parameters
     ----------
     template, poses, shapes, skeleton, config, progress, step, prior
         As for `learn_scape`.
 
+    Returns
+    -------
+    BlendScapeModel
+        The model; `blend` (F, J) holds the weights of the rotations.
+
     Raises
     ------
     ValueError
         As `learn_scape`.
 
+    Examples
+    --------
+    >>> from model import load_built_in_model
+    >>> known = load_built_in_model()
+    >>> try:
+    ...     learn_blendscape(known.template, known.template.vertices[None], None, known.skeleton)
+    ... except ValueError as error:
+    ...     print(error)
+    poses: expected at least 2 bodies, got 1
+
     [BlendSCAPE]
     """
     check_training(template, skeleton, poses, shapes, prior)
-    # a share of the template's diagonal: so far a rotation blends over the border of its part
+    # rotations blend over 1% of the template's diagonal on each side of a border
     blend = face_weights(template, skeleton, 0.01 * float(np.linalg.norm(np.ptp(template.vertices, axis=0))))
     parts = BlendedTemplate(template, skeleton, blend)
     learned = _learn_spaces(parts, poses, shapes, config, ProgressShares(progress, step), prior)
@@ -141,7 +176,7 @@ def learn_blendscape(template: Mesh, poses: np.ndarray, shapes: np.ndarray | Non
 
 def _learn_spaces(parts: BlendedTemplate, poses: np.ndarray, shapes: np.ndarray | None, config: LearnConfig | None,
                   work: ProgressShares, prior: TemplatePrior | None) -> dict[str, Any]:
-    """Pose space, shape space, pose prior and info of a SCAPE model of either kind."""
+    """Learn pose space, shape space, pose prior and info of a SCAPE or BlendSCAPE model."""
     config = config or LearnConfig()
     poses, shapes = check_training(parts.template, parts.skeleton, poses, shapes, prior)
     learned = learn_pose_with(prior, parts, poses, config, work)                           # [SCAPE] Eq. 3, Eq. 4, Eq. 5
@@ -152,10 +187,10 @@ def _learn_spaces(parts: BlendedTemplate, poses: np.ndarray, shapes: np.ndarray 
 
 def learn_pose_with(prior: TemplatePrior | None, parts: BlendedTemplate, bodies: np.ndarray, config: LearnConfig,
                     work: ProgressShares) -> LearnedPose:
-    """The pose space of bodies (M, N, 3), which leans on a prior where there is one; two thirds of the work."""
+    """Learn the pose space of bodies (M, N, 3), with a prior where there is one; two thirds of the work."""
     if prior is None:
         return learn_pose(parts, bodies, config, work, POSES)
-    # the prior's own bodies are learned from in the same way, on this skeleton
+    # first the pose space of the prior's bodies, in the same way on this skeleton
     known = learn_pose(parts, prior.poses, replace(PRIOR, features=config.features, smoothness=config.smoothness),
                        work, POSES / 3)
     return learn_pose(parts, bodies, config, work, 2 * POSES / 3, known)
@@ -163,7 +198,7 @@ def learn_pose_with(prior: TemplatePrior | None, parts: BlendedTemplate, bodies:
 
 @dataclass(frozen=True, eq=False)
 class LearnedPose:
-    """What was learned of the poses: the pose space, the poses (M, J, 3) of the training bodies, what was chosen."""
+    """Result of `learn_pose`: the pose space, the poses (M, J, 3) of the training bodies, the chosen design."""
 
     space: PoseSpace
     poses: np.ndarray
@@ -173,9 +208,10 @@ class LearnedPose:
 def learn_pose(parts: BlendedTemplate, bodies: np.ndarray, config: LearnConfig, work: ProgressShares,
                share: float = 1.0,
                prior: LearnedPose | None = None) -> LearnedPose:
-    """The pose space, first as in the paper, then refined on the stitched surface; a share of the work.
+    """Learn the pose space, first as in the paper, then refined on the stitched surface; a share of the work.
 
-    A prior is taken where left-out poses are predicted better with it, which are none of a single one.
+    A prior is used where it predicts left-out poses better, and always with a single pose.
+
     [SCAPE] Eq. 3, Eq. 4, Eq. 5
     """
     template, skeleton = parts.template, parts.skeleton
@@ -183,14 +219,14 @@ def learn_pose(parts: BlendedTemplate, bodies: np.ndarray, config: LearnConfig, 
     system = GradientSystem(template, config.smoothness, skeleton.part_of_face)
 
     def first(_: ProgressShares) -> LearnedPose:
-        """Q of every body from the rotations of Procrustes, regressed on the joint twists."""
+        """Fit Q of every body with the rotations of Procrustes, and regress it on the joint twists."""
         poses = skeleton.pose_of(skeleton.fit_rotations(template, bodies))                      # R, then Δr
         Q = pose_gradients(system, parts.local_edges(bodies, poses))                            # [SCAPE] Eq. 5
         designs = [choose_design(template, skeleton, poses, config, by_edges(template, poses, Q))]
         if prior is not None:
             judge = by_edges(template, poses, Q - prior.space.gradients(poses))
             designs.insert(0, choose_design(template, skeleton, poses, config, judge, prior=prior.space))
-        design = min(designs, key=attrgetter("left_out_error"))         # of equals, as of one pose, that with the prior
+        design = min(designs, key=attrgetter("left_out_error"))         # among equals, as with one pose, the prior wins
         return LearnedPose(design.fit(poses, Q), poses, design)                                 # [SCAPE] Eq. 4
 
     def learn(inner: ProgressShares) -> LearnedPose:
@@ -199,7 +235,7 @@ def learn_pose(parts: BlendedTemplate, bodies: np.ndarray, config: LearnConfig, 
         for k in range(config.refinements):
             learned = inner.step(f"refinement {k}", inputs, share,
                                  partial(_refine, parts, system, bodies, config, learned, k == 0))
-        # features are joined to the few mixtures that matter, in the poses seen and in those of the prior
+        # features are combined into the few mixtures that matter in the training poses and those of the prior
         tolerance = config.detail * template.mean_edge
         seen = learned.poses if prior is None else np.concatenate([learned.poses, prior.poses])
         return learned if not tolerance else replace(
@@ -210,16 +246,18 @@ def learn_pose(parts: BlendedTemplate, bodies: np.ndarray, config: LearnConfig, 
 
 def _refine(parts: BlendedTemplate, system: GradientSystem, bodies: np.ndarray, config: LearnConfig,
             learned: LearnedPose, choosing: bool, work: ProgressShares) -> LearnedPose:
-    """The part rotations fitted anew, and Q regressed again on what the stitched model leaves.
+    """Fit the part rotations again, and regress Q again with the residual of the stitched model.
 
-    Stitching sees only what neighbouring triangles agree on, and Eq. 4 does not know it. So what the stitched model
-    leaves of every body, as deformation of the triangles, is added to what the model says now, and regressed again:
-    majorise and minimise, which lowers the error of the stitched edges step by step. What Q depends on is chosen first
-    by the edges of left-out poses, and after the first fit of the rotations once more by their stitched vertices.
+    Stitching keeps only what neighbouring triangles agree on, which Eq. 4 ignores. So the residual of every stitched
+    body, as deformation of the triangles, is added to the model's Q and regressed again. That is majorisation and
+    minimisation: it lowers the error of the stitched edges step by step. The design is chosen by the edges of left-out
+    poses at first, and once more by their stitched vertices after the first fit of the rotations.
+
+    [SCAPE] Eq. 4, Eq. 5
     """
     space, design, subject = learned.space, learned.design, parts.subject(learned.space)
     poses = fit_poses(subject, bodies, learned.poses, work)
-    # corrections of the regression after each fit of the part rotations
+    # three corrections of the regression after each fit of the part rotations
     for number in range(3):
         subject = parts.subject(space) if number else subject
         left = parts.local_edges(bodies - subject.vertices(poses), poses)
@@ -227,7 +265,7 @@ def _refine(parts: BlendedTemplate, system: GradientSystem, bodies: np.ndarray, 
             Q = space.gradients(poses) + _correction(parts, system, left)
 
             def by_vertices(tried: Design, Q: np.ndarray = Q) -> float:
-                """The mean distance of the stitched vertices of left-out poses, well placed, metres."""
+                """Compute the mean error, metres, of stitched vertices of left-out poses, apart from their place."""
                 off = np.stack([parts.stitch(predicted, pose) - body for body, pose, predicted in
                                 zip(bodies, poses, predict_left_out(tried, poses, Q), strict=True)])
                 return float(np.linalg.norm(off - off.mean(axis=1, keepdims=True), axis=2).mean())
@@ -239,14 +277,14 @@ def _refine(parts: BlendedTemplate, system: GradientSystem, bodies: np.ndarray, 
 
 
 def _correction(parts: BlendedTemplate, system: GradientSystem, left: np.ndarray) -> np.ndarray:
-    """What edges (n, F, 2, 3) that the model leaves add to Q (n, F, 3, 3), which is linear in them. [SCAPE] Eq. 5"""
+    """Compute the change of Q (n, F, 3, 3) from residual edges (n, F, 2, 3), in which it is linear. [SCAPE] Eq. 5"""
     return pose_gradients(system, parts.v_hat + left) - np.eye(3)
 
 
 def fit_poses(subject: Subject, bodies: np.ndarray, poses: np.ndarray, work: ProgressShares,
               config: FitConfig | None = None
               ) -> np.ndarray:
-    """Poses (M, J, 3), radians, with which the subject comes nearest to the bodies, from poses nearby."""
+    """Fit poses (M, J, 3), radians, of the subject to bodies, from nearby poses."""
     fitter = PoseFitter(subject, config or FitConfig(polish=0))
     fitted = []
     for body, pose in zip(bodies, poses, strict=True):
@@ -258,7 +296,7 @@ def fit_poses(subject: Subject, bodies: np.ndarray, poses: np.ndarray, work: Pro
 def learn_people(parts: BlendedTemplate, space: PoseSpace, shapes: np.ndarray | None, config: LearnConfig,
                  work: ProgressShares,
                  prior: TemplatePrior | None = None) -> ShapeSpace:
-    """The space of body shapes of people (P, N, 3), who may be none, and of the prior's. [SCAPE] Eq. 7, Eq. 8"""
+    """Learn the shape space of people (P, N, 3), if any, and of those of the prior. [SCAPE] Eq. 7, Eq. 8"""
     if shapes is None and prior is None:
         work.tick(1 - POSES)
         return ShapeSpace.empty(len(parts.template.faces))
@@ -277,7 +315,7 @@ def learn_people(parts: BlendedTemplate, space: PoseSpace, shapes: np.ndarray | 
 
 def prior_deformations(parts: BlendedTemplate, space: PoseSpace, people: np.ndarray, config: LearnConfig
                        ) -> np.ndarray:
-    """S (1 + K, F, 3, 3), in float32, of the people of a prior, who all stand in the pose of the first.
+    """Fit S (1 + K, F, 3, 3), in float32, of the people of a prior, who all stand in the pose of the first.
 
     [SCAPE] Eq. 8
     """
@@ -289,10 +327,10 @@ def prior_deformations(parts: BlendedTemplate, space: PoseSpace, people: np.ndar
 def shape_deformations(parts: BlendedTemplate, space: PoseSpace, shapes: np.ndarray, config: LearnConfig,
                        work: ProgressShares
                        ) -> np.ndarray:
-    """S (P, F, 3, 3) of every person, in float32 to halve the memory.
+    """Fit S (P, F, 3, 3) of every person, in float32 to halve the memory.
 
-    Poses are those of Procrustes. Fitting each part to the template in the pose found, again and again, left the same
-    error on new people (6.50, 5.44 and 4.37 mm at 20, 40 and 80 components against 6.48, 5.47 and 4.38).
+    Poses are those of Procrustes. Refining them by the posed template did not change the error on new people: 6.50,
+    5.44 and 4.37 mm at 20, 40 and 80 components, against 6.48, 5.47 and 4.38 mm.
 
     [SCAPE] Eq. 8
     """
@@ -305,33 +343,33 @@ def shape_deformations(parts: BlendedTemplate, space: PoseSpace, shapes: np.ndar
         return shape_gradients(system, posed, parts.local_edges(y, pose)).astype(np.float32)
 
     S = np.empty((len(shapes), len(template.faces), 3, 3), dtype=np.float32)
-    with SideBySide(deformation, list(shapes)) as found:
+    with SideBySide(deformation, list(shapes)) as solved:
         for i, y in enumerate(shapes):
             S[i] = work.step(f"person {body_digest(y)}", (parts, space, config.smoothness, y), 1 / len(shapes),
-                             lambda _, number=i: found(number))                # type: ignore[misc]
+                             lambda _, number=i: solved(number))                # type: ignore[misc]
     return S
 
 
 def training_metadata(template: Mesh, skeleton: Skeleton, learned: LearnedPose, poses: np.ndarray,
                       shapes: np.ndarray | None, config: LearnConfig, prior: TemplatePrior | None = None
                       ) -> dict[str, Any]:
-    """What a model keeps of its making: the pose prior, its examples, and settings, choices, sizes and digests."""
+    """Collect what a model keeps of its making: pose prior, examples, settings, choices, sizes and digests."""
     design, examples = learned.design, pose_examples(template, skeleton, learned.poses, shapes)
     mean, covariance = estimate_pose_prior(template, skeleton, examples, len(poses))
-    if prior is not None:                   # what joints do that no scan bends
+    if prior is not None:                   # poses of joints that no scan bends
         examples = np.concatenate([examples, pose_examples(
             template, skeleton, skeleton.pose_of(skeleton.fit_rotations(template, prior.poses)))])
     of_prior = {} if prior is None else describe_prior(prior, skeleton, learned)
-    # metres by which the built-in people's movement misses SCAPE poses of one scan
+    # with a single pose none can be left out: 16 mm is the error of the built-in prior on SCAPE poses of one scan
     return {"pose_mean": mean, "pose_covariance": covariance, "pose_examples": examples, "info": {
         "settings": asdict(config), "poses": len(poses), "shapes": 0 if shapes is None else len(shapes),
         "pruning": design.pruning, "ridge": design.ridge, "features": learned.space.features.count,
-        "left_out_error": design.left_out_error if len(poses) > 1 else 0.016,     # of a single pose none is left out
+        "left_out_error": design.left_out_error if len(poses) > 1 else 0.016,
         "digest": digest(template, poses, shapes), "digests": body_digests(poses, shapes), **of_prior}}
 
 
 def describe_prior(prior: TemplatePrior, skeleton: Skeleton, learned: LearnedPose) -> dict[str, Any]:
-    """What of a model is the prior's: its name, how many people its own count as, and the joints."""
+    """Describe what a model took from its prior: its name, how many people it counts as, and the joints."""
     evidence = joint_evidence(learned)
     joints = [joint_in_words(name) for name, share in zip(skeleton.names, evidence, strict=True) if share < 0.5]
     return {"prior": prior.name, "prior_people": WORTH, "joint_evidence": evidence,
@@ -339,10 +377,10 @@ def describe_prior(prior: TemplatePrior, skeleton: Skeleton, learned: LearnedPos
 
 
 def joint_evidence(learned: LearnedPose) -> list[float]:
-    """How much of the deformation by each joint (J,) the scans say, from 0, all is the prior's, to 1.
+    """Compute the share of each joint's deformation (J,) that the scans determine, from 0 (the prior alone) to 1.
 
-    A ridge regression takes from data the share v / (v + penalty) along a twist direction of variance v. The direction
-    in which a joint moved most counts; one that was pruned says nothing. The root, which deforms nothing, has 1.
+    Ridge regression takes the share v / (v + penalty) from data along a twist direction of variance v. The direction in
+    which a joint moved most counts; pruned directions count 0. The root deforms nothing and has 1.
 
     [SCAPE] Eq. 4
     """
@@ -357,12 +395,12 @@ def joint_evidence(learned: LearnedPose) -> list[float]:
 
 def estimate_pose_prior(template: Mesh, skeleton: Skeleton, examples: np.ndarray, count: int
                         ) -> tuple[np.ndarray, np.ndarray]:
-    """Mean (J, 3) and covariance (3J, 3J) of poses, radians, zero for the root, from `pose_examples` (M, J, 3).
+    """Estimate mean (J, 3) and covariance (3J, 3J) of poses, radians, zero for the root, from examples (M, J, 3).
 
-    The first `count`, which one person took for the sake of the pose, are mixed with what people do. They and the
-    rest, in which people stood, count alike, however many there are of each. A limb that nothing is known of would
-    else be as likely behind the back as at the side: on half views of five men that were not learned from, that left
-    20 mm where nothing was seen, and this 14.
+    The first `count` examples are the poses of one person, and are mixed with those of all people. They have the same
+    weight as the rest, in which people stood, whatever their numbers. Otherwise an unseen limb would be as likely
+    behind the back as at the side. On half views of five men that were left out, the error of the unseen surface is
+    14 mm instead of 20 mm.
     """
     flat, one_kind = examples.reshape(len(examples), -1), count == len(examples)
 
@@ -376,9 +414,9 @@ def estimate_pose_prior(template: Mesh, skeleton: Skeleton, examples: np.ndarray
 
 def pose_examples(template: Mesh, skeleton: Skeleton, poses: np.ndarray, shapes: np.ndarray | None = None
                   ) -> np.ndarray:
-    """Poses (M, J, 3), radians, that bodies were seen in: the training poses, and how the people (P, N, 3) stand.
+    """Collect the poses (M, J, 3), radians, of the training bodies: `poses`, and those in which people (P, N, 3) stand.
 
-    All are at most π, the root is at rest.
+    Rotations are at most π; the root is at rest.
     """
     if shapes is not None:
         poses = np.concatenate([poses, skeleton.pose_of(skeleton.fit_rotations(template, shapes))])
@@ -389,7 +427,7 @@ def pose_examples(template: Mesh, skeleton: Skeleton, poses: np.ndarray, shapes:
 
 def check_training(template: Mesh, skeleton: Skeleton, poses: np.ndarray, shapes: np.ndarray | None,
                    prior: TemplatePrior | None = None) -> tuple[np.ndarray, np.ndarray | None]:
-    """Poses (M, N, 3) and people (P, N, 3) that a model can be learned from, or ValueError."""
+    """Check poses (M, N, 3) and people (P, N, 3) for learning and return them as arrays; else ValueError."""
     if prior is not None and prior.poses.shape[1:] != template.vertices.shape:
         raise ValueError(f"prior: it was brought to a template of {prior.poses.shape[1]} vertices, not to this one of "
                          f"{len(template.vertices)}")
@@ -400,7 +438,7 @@ def check_training(template: Mesh, skeleton: Skeleton, poses: np.ndarray, shapes
 
 
 def check_skeleton(template: Mesh, skeleton: Skeleton) -> None:
-    """ValueError for a skeleton of another template."""
+    """Raise ValueError for a skeleton of another template."""
     if len(skeleton.part_of_face) != len(template.faces):
         raise ValueError(f"skeleton: it has {len(skeleton.part_of_face)} faces, "
                          f"the template {len(template.faces)}")
@@ -410,9 +448,9 @@ def check_skeleton(template: Mesh, skeleton: Skeleton) -> None:
 
 
 def judge_model(model: BodyModel, people: np.ndarray | None = None) -> Judgement:
-    """What a model learned with people (S, N, 3), metres, is worth: whether it means nothing, what it never saw."""
-    learned = model.info.get("poses", 0)                # of nobody's poses are the examples of imported models
-    known = "joints_of_prior" in model.info             # what no pose shows is known otherwise
+    """Judge a model learned with people (S, N, 3), metres: whether it is useless, and which joints never bent."""
+    learned = model.info.get("poses", 0)                # imported models were not learned from poses
+    known = "joints_of_prior" in model.info             # a prior knows the joints that no pose bends
     stiff = stiff_joints(model.pose_examples[:learned]) if learned and not known else ()
     never, doubts = f"never bent more than {np.degrees(STIFF):.0f} degrees in your poses", []
     if len(stiff) and len(stiff) == len(model.skeleton.parents) - 1:
@@ -423,8 +461,8 @@ def judge_model(model: BodyModel, people: np.ndarray | None = None) -> Judgement
         doubts = ["the body has one part and no joint: it takes no pose"]
     doubts += skeleton_doubts(model.skeleton)
     error = model.info.get("left_out_error", 0.0)
-    # Metres by which a prior should not miss left-out poses: of one man 12 to 16 from three poses on, of four of him
-    # with four other men, told to be one person, 27
+    # with a prior, larger errors (metres) on left-out poses point to wrong meshes. One man's poses have 12 to 16 mm,
+    # from three poses on; four poses of him mixed with four other men have 27 mm.
     strange = 0.02
     if known and error > strange:
         doubts += [f"a pose that was left out is predicted {1000 * error:.0f} mm off, more than by the prior alone: "
@@ -435,7 +473,7 @@ def judge_model(model: BodyModel, people: np.ndarray | None = None) -> Judgement
 
 
 def learning_problem(model: BodyModel, people: np.ndarray | None = None) -> str | None:
-    """Why a model learned with people (S, N, 3) means nothing, with the likely cause; None where it means something."""
+    """Explain why a model learned with people (S, N, 3) is useless, with the likely cause; None where it is usable."""
     error, body = float(model.info.get("left_out_error", 0.0)), model.template
     if len(model.skeleton.parents) == 1 and not model.n_betas:
         return "the meshes differ neither in pose nor in shape: the body has one part, no joint and no shape components"

@@ -1,4 +1,4 @@
-"""Models of women, of men and of everybody, from one training set; and the plane that parts their betas."""
+"""Models of women, of men and of everybody from one training set, and the plane that separates their betas."""
 from __future__ import annotations
 
 from collections.abc import Sequence
@@ -35,16 +35,16 @@ from .scape import (
 def learn_by_sex(template: Mesh, poses: np.ndarray, shapes: np.ndarray, sexes: Sequence[str], skeleton: Skeleton,
                  config: LearnConfig | None = None, progress: Progress | None = None, step: Step = run_uncached,
                  prior: TemplatePrior | None = None) -> dict[str, ScapeModel]:
-    """Learn a model of everybody and one of each sex: one pose space, and a space of shapes a group.
+    """Learn a model of everybody and one of each sex, with one common pose space.
 
     Parameters
     ----------
     template, poses, shapes, skeleton, config, progress, step
         As for `learn_scape`.
     sexes : S strings
-        "female", "male", or "" where it is not known; those count in the model of everybody alone.
+        "female", "male", or "" where it is not known; those count only in the model of everybody.
     prior : TemplatePrior, optional
-        Of the movement; shapes are those of the people alone.
+        Prior of the pose space; shapes are learned from the people alone.
 
     Returns
     -------
@@ -80,21 +80,21 @@ def learn_by_sex(template: Mesh, poses: np.ndarray, shapes: np.ndarray, sexes: S
 
     spaces, plane = work.step("shape components", (parts, learned.space, people, config.smoothness, config.components,
                                                    list(sexes)), 1 - POSES, learn)
-    kept = training_metadata(template, skeleton, learned, poses, people, config, prior)
+    common = training_metadata(template, skeleton, learned, poses, people, config, prior)
     if prior is not None:
-        kept["info"]["prior_people"] = 0.0                 # shapes are those of the people alone
+        common["info"]["prior_people"] = 0.0                 # shapes are those of the people alone
     models = {}
     for name, chosen in groups.items():
-        info = {**kept["info"], "sex": name, "shapes": len(chosen), "digest": digest(template, poses, people[chosen]),
+        info = {**common["info"], "sex": name, "shapes": len(chosen), "digest": digest(template, poses, people[chosen]),
                 "digests": body_digests(poses, people[chosen])}
         if name == "neutral" and plane is not None:
             info[PLANE] = plane
-        models[name] = ScapeModel(template, skeleton, learned.space, spaces[name], **{**kept, "info": info})
+        models[name] = ScapeModel(template, skeleton, learned.space, spaces[name], **{**common, "info": info})
     return models
 
 
 def _groups(sexes: Sequence[str], count: int) -> dict[str, np.ndarray]:
-    """The people of every model that can be learned, or ValueError."""
+    """List the people of every model that can be learned; ValueError for wrong sexes."""
     if isinstance(sexes, str) or len(sexes) != count:
         raise ValueError(f"sexes: expected {count}, one a person, got {len(sexes)}")
     unknown = sorted({sex for sex in sexes if sex not in (*SEXES, "")})
@@ -103,7 +103,7 @@ def _groups(sexes: Sequence[str], count: int) -> dict[str, np.ndarray]:
     groups = {"neutral": np.arange(count)}
     for sex in SEXES:
         chosen = np.flatnonzero(np.array(list(sexes), dtype=object) == sex)
-        # people that span a space of shapes
+        # one person spans no shape space
         if len(chosen) >= 2:
             groups[sex] = chosen
     return groups
@@ -111,9 +111,11 @@ def _groups(sexes: Sequence[str], count: int) -> dict[str, np.ndarray]:
 
 @dataclass(frozen=True, eq=False)
 class SexPlane:
-    """A plane between the betas of women and men: its unit normal `weights` (K,), towards the men, and the signed
-    distance `weights @ betas + bias`. Planes learned without them told the share `accuracy` of the `count` people
-    right, and give the probability of a man, `1 / (1 + exp(-slope distance))`.
+    """A plane between the betas of women and men.
+
+    `weights` (K,) is its unit normal, towards the men; the signed distance is `weights @ betas + bias`. In cross-
+    validation the share `accuracy` of the `count` people was classified right. The probability of a man is
+    `1 / (1 + exp(-slope distance))`.
     """
 
     weights: np.ndarray
@@ -123,15 +125,16 @@ class SexPlane:
     slope: float
 
     def to_arrays(self) -> dict[str, Any]:
-        """What a model keeps of it."""
+        """Return what a model keeps of it."""
         return {**vars(self), "weights": self.weights.tolist()}
 
 
 @dataclass(frozen=True)
 class SexGuess:
-    """Whether betas are a woman's or a man's: the sex, the signed distance from the plane between them in standard
-    deviations, positive for a man, and the probability of that sex, as often as the model's own people were told right
-    at such a margin.
+    """Result of `guess_sex`.
+
+    `margin` is the signed distance from the plane between women and men, standard deviations, positive for a man.
+    `probability` is that of `sex`, from the cross-validation of the model's own people at such margins.
     """
 
     sex: str
@@ -140,13 +143,13 @@ class SexGuess:
 
 
 def learn_sex_plane(betas: np.ndarray, sexes: Sequence[str]) -> SexPlane:
-    """The plane of a linear support vector machine between betas (P, K) of "female" and "male", at least two of each.
+    """Learn the plane between betas (P, K) of "female" and "male", at least two of each, by a linear SVM.
 
-    How soft it is, is chosen by planes that have not seen a fifth of the people; of those that tell equally well the
-    softest is taken. The first betas count, a third as many as people.
+    The penalty is chosen by five-fold cross-validation; among equals the softest is taken. Only the first betas count,
+    a third as many as people.
     """
     betas, men = np.asarray(betas, dtype=np.float64), np.array([sex == "male" for sex in sexes], dtype=bool)
-    # three people for each beta that counts: with a beta a person everybody is like nobody else
+    # three people for each beta: with as many betas as people any labels could be separated
     count, betas = betas.shape[1], betas[:, :max(1, len(betas) // 3)]
     tried = [(_unseen(betas, men, C), C) for C in (0.003, 0.01, 0.03, 0.1, 0.3, 1.0)]       # the softest first
     right = [float(np.mean((margins > 0) == men)) for margins, _ in tried]
@@ -157,7 +160,7 @@ def learn_sex_plane(betas: np.ndarray, sexes: Sequence[str]) -> SexPlane:
 
 
 def _plane(betas: np.ndarray, men: np.ndarray, C: float) -> tuple[np.ndarray, float]:
-    """Normal (K,), of length 1, and bias of the plane of a support vector machine."""
+    """Fit a support vector machine; return the unit normal (K,) and bias of its plane."""
     from sklearn.svm import SVC
 
     machine = SVC(kernel="linear", C=C, class_weight="balanced").fit(betas, men)
@@ -166,7 +169,7 @@ def _plane(betas: np.ndarray, men: np.ndarray, C: float) -> tuple[np.ndarray, fl
 
 
 def _unseen(betas: np.ndarray, men: np.ndarray, C: float) -> np.ndarray:
-    """(P,) distances of people from planes that were learned without them."""
+    """Compute distances (P,) of people from planes that were learned without them."""
     from sklearn.model_selection import StratifiedKFold
 
     folds = StratifiedKFold(min(5, int(men.sum()), int((~men).sum())), shuffle=True, random_state=0)
@@ -178,7 +181,7 @@ def _unseen(betas: np.ndarray, men: np.ndarray, C: float) -> np.ndarray:
 
 
 def _certainty(margins: np.ndarray, men: np.ndarray) -> float:
-    """How fast the odds of a man grow with margins (P,)."""
+    """Fit how fast the log-odds of a man grow with margins (P,)."""
     from sklearn.linear_model import LogisticRegression
 
     found = LogisticRegression(class_weight="balanced", fit_intercept=False).fit(margins[:, None], men)
@@ -186,13 +189,14 @@ def _certainty(margins: np.ndarray, men: np.ndarray) -> float:
 
 
 def guess_sex(model: BodyModel, betas: np.ndarray) -> SexGuess:
-    """Whether betas of the neutral model are a woman's or a man's, by the plane that the model keeps.
+    """Guess whether betas of the neutral model are a woman's or a man's, by the plane that the model keeps.
 
     Parameters
     ----------
     model : BodyModel
         The neutral model of `learn_by_sex`, learned from people of both sexes.
     betas : (k,) float, k ≤ K
+        Shape coefficients, standard deviations.
 
     Raises
     ------
@@ -209,16 +213,16 @@ def guess_sex(model: BodyModel, betas: np.ndarray) -> SexGuess:
 
 
 def sex_plane(model: BodyModel) -> SexPlane:
-    """The plane that a model keeps, or ValueError where it keeps none or a damaged one."""
-    kept = model.info.get(PLANE)
-    if kept is None:
+    """Read the plane that a model keeps; ValueError where it keeps none or a damaged one."""
+    stored = model.info.get(PLANE)
+    if stored is None:
         raise ValueError("model: it keeps nothing that tells women from men; learn one of both sexes with "
                          "learn_by_sex (scape learn --by-sex)")
     try:
-        weights = np.array(kept["weights"], dtype=np.float64)
-        numbers = {name: float(kept[name]) for name in ("bias", "accuracy", "slope")}
+        weights = np.array(stored["weights"], dtype=np.float64)
+        numbers = {name: float(stored[name]) for name in ("bias", "accuracy", "slope")}
         if weights.shape != (model.n_betas,) or not np.isfinite([*weights, *numbers.values()]).all():
             raise ValueError(f"expected {model.n_betas} finite weights, found shape {weights.shape}")
-        return SexPlane(weights, count=int(kept["count"]), **numbers)
+        return SexPlane(weights, count=int(stored["count"]), **numbers)
     except (KeyError, TypeError, ValueError) as error:
         raise ValueError(f"model: what tells women from men is damaged ({error})") from None

@@ -23,8 +23,8 @@ from ..skinning import SkinningModel, invert_blended
 from .regression import ridge_operator
 from .scape import POSES, Progress, ProgressShares, check_training, estimate_pose_prior, fit_poses, pose_examples
 
-RIDGES = (1e-4, 1e-3, 3e-3, 0.01, 0.03, 0.1, 0.3)      # penalties; the one that predicts left-out poses best is taken
-QUICK = FitConfig(sample=400, iterations=20, polish=0, tolerance=1e-4)     # of poses that will be fitted again
+RIDGES = (1e-4, 1e-3, 3e-3, 0.01, 0.03, 0.1, 0.3)      # penalties, of which the best on left-out poses is taken
+QUICK = FitConfig(sample=400, iterations=20, polish=0, tolerance=1e-4)     # poses are fitted again in the next round
 
 
 @dataclass(frozen=True)
@@ -34,16 +34,23 @@ class SkinConfig(Settings):
     Attributes
     ----------
     correctives : bool
-        Linear functions of the joint twists displace the rest vertices; without them it is plain linear blend skinning.
+        Learn pose-corrective shapes, linear in the joint twists; else plain linear blend skinning.
     parts : int
         Largest number of parts that a vertex follows.
     width : float, metres
-        Over so much surface the weights pass from part to part before they are fitted.
+        Width over which the initial blend weights change from part to part.
     rounds : int
-        Largest number of times that poses, weights and joints are fitted in turn, first without correctives and
-        then with them.
+        Largest number of rounds in which poses, weights and joints are fitted in turn, first without and then with
+        correctives.
     components : int
         Shape components to keep, fewer where there are fewer people.
+
+    Examples
+    --------
+    >>> SkinConfig(correctives=False).parts
+    4
+
+    Loper et al., SMPL, 2015.
     """
 
     correctives: bool = True
@@ -62,13 +69,31 @@ def learn_skinning(template: Mesh, poses: np.ndarray, shapes: np.ndarray | None,
     Parameters
     ----------
     template, poses, shapes, skeleton, progress, step
-        As for `learn_scape`; joints are sought near those of the skeleton.
+        As for `learn_scape`; joints are fitted near those of the skeleton.
     config : SkinConfig, optional
+        Settings.
+
+    Returns
+    -------
+    SkinningModel
+        Blend weights, joints, pose correctives and shape components.
 
     Raises
     ------
     ValueError
         As `learn_scape`.
+
+    Examples
+    --------
+    >>> from model import load_built_in_model
+    >>> known = load_built_in_model()
+    >>> try:
+    ...     learn_skinning(known.template, known.template.vertices[None], None, known.skeleton)
+    ... except ValueError as error:
+    ...     print(error)
+    poses: expected at least 2 bodies, got 1
+
+    Loper et al., SMPL, 2015.
     """
     config = config or SkinConfig()
     poses, shapes = check_training(template, skeleton, poses, shapes)
@@ -95,7 +120,7 @@ def learn_skinning(template: Mesh, poses: np.ndarray, shapes: np.ndarray | None,
 
 
 def _start(template: Mesh, skeleton: Skeleton, config: SkinConfig) -> SkinningModel:
-    """The template itself, with weights that pass smoothly from part to part, and no correctives."""
+    """Build the initial model: the template with smooth blend weights and without correctives."""
     J, N = len(skeleton.parents), len(template.vertices)
     constants = corrective_features(skeleton, np.zeros((1, J, 3)), False)
     weights = strongest(diffuse_weights(template, skeleton, config.width), config.parts, 1e-3)
@@ -106,7 +131,7 @@ def _start(template: Mesh, skeleton: Skeleton, config: SkinConfig) -> SkinningMo
 
 def _learn_pose(model: SkinningModel, poses: np.ndarray, bodies: np.ndarray, config: SkinConfig, share: float,
                 work: ProgressShares) -> tuple[SkinningModel, np.ndarray]:
-    """Poses, weights, joints, rest vertices and correctives in turn, while left-out poses are met better."""
+    """Fit poses, weights, joints, rest vertices and correctives in turn, while the left-out error falls."""
     allowed = diffuse_weights(model.template, model.skeleton, 2 * config.width) > 0
     model = replace(model, info={"left_out_error": np.inf})
     for k in range(config.rounds):
@@ -115,7 +140,7 @@ def _learn_pose(model: SkinningModel, poses: np.ndarray, bodies: np.ndarray, con
         gain = 1 - tried.info["left_out_error"] / model.info["left_out_error"]
         if gain > 0:
             model, poses = tried, fitted
-        # relative gain of a round below which the next is not worth it
+        # a round that gains less than 0.5% is the last
         if gain < 0.005:
             break
     return model, poses
@@ -123,7 +148,7 @@ def _learn_pose(model: SkinningModel, poses: np.ndarray, bodies: np.ndarray, con
 
 def _next_round(model: SkinningModel, poses: np.ndarray, bodies: np.ndarray, allowed: np.ndarray, config: SkinConfig,
                 work: ProgressShares) -> tuple[SkinningModel, np.ndarray]:
-    """Poses, weights, joints, rest vertices and correctives, each fitted to the others once."""
+    """Fit poses, weights, joints, rest vertices and correctives, each to the others, once."""
     fitted = fit_poses(model.subject(), bodies, poses, work, QUICK)
     tried = _with_weights(model, fitted, bodies, allowed, config)
     tried = _with_joints(tried, fitted, bodies)
@@ -131,28 +156,29 @@ def _next_round(model: SkinningModel, poses: np.ndarray, bodies: np.ndarray, all
 
 
 def _carry_by_each_part(model: SkinningModel, pose: np.ndarray, body: np.ndarray) -> np.ndarray:
-    """(J, N, 3) where each part alone would carry each vertex, the whole standing where the body stands."""
+    """Compute where each part alone would carry each vertex, (J, N, 3), with the whole placed at the body."""
     R, turns = model.skeleton.part_rotations(pose), model.joint_turns(pose)
     offset = np.einsum("pj,jde,je->pd", model.skeleton.descends.astype(float), turns,
                        model.joint_regressor @ model.rest)
-    each = (model.rest + model.corrections(pose)) @ np.swapaxes(R, -1, -2) + offset[:, None]
-    return np.asarray(each + (body - np.einsum("np,pnd->nd", model.weights, each)).mean(axis=0))
+    by_part = (model.rest + model.corrections(pose)) @ np.swapaxes(R, -1, -2) + offset[:, None]
+    return np.asarray(by_part + (body - np.einsum("np,pnd->nd", model.weights, by_part)).mean(axis=0))
 
 
 def _with_weights(model: SkinningModel, poses: np.ndarray, bodies: np.ndarray, allowed: np.ndarray,
                   config: SkinConfig) -> SkinningModel:
-    """The model with weights fitted to the bodies at their poses."""
+    """Fit the blend weights to the bodies at their poses."""
     carried = [_carry_by_each_part(model, p, y) for p, y in zip(poses, bodies, strict=True)]
     weights = fit_weights(carried, bodies, model.template, model.weights, allowed)
     return replace(model, weights=strongest(weights, config.parts, 1e-3))
 
 
 def _with_joints(model: SkinningModel, poses: np.ndarray, bodies: np.ndarray) -> SkinningModel:
-    """The model with joints where they fit best, which is linear least squares once the poses are known."""
+    """Fit the joints to the bodies: linear least squares, since the poses are known."""
     J = len(model.skeleton.parents)
     if J == 1:
         return model
-    below = model.below[:, 1:] - model.below[:, 1:].mean(axis=0)              # the place of a body is free
+    # a joint j moves vertex n by below_nj (R_parent - R_j); the place of each body is free
+    below = model.below[:, 1:] - model.below[:, 1:].mean(axis=0)
     overlap, normal, slope = below.T @ below, np.zeros((J - 1, 3, J - 1, 3)), np.zeros((J - 1, 3))
     joints = model.joint_regressor @ model.rest
     for pose, body in zip(poses, bodies, strict=True):
@@ -161,15 +187,15 @@ def _with_joints(model: SkinningModel, poses: np.ndarray, bodies: np.ndarray) ->
         normal += np.einsum("ab,aki,bkj->aibj", overlap, D, D)
         slope += np.einsum("aki,ak->ai", D, left)
     flat = normal.reshape(3 * J - 3, -1)
-    flat += 1e-3 * np.trace(flat) / len(flat) * np.eye(len(flat))             # what nothing decides stays
+    flat += 1e-3 * np.trace(flat) / len(flat) * np.eye(len(flat))             # directions without evidence stay
     moved = joints.copy()
     moved[1:] += np.linalg.solve(flat, slope.ravel()).reshape(J - 1, 3)
     return _with_joints_at(model, moved)
 
 
 def _with_joints_at(model: SkinningModel, wanted: np.ndarray) -> SkinningModel:
-    """The model whose joints, as combinations of its rest vertices, lie where wanted."""
-    for _ in range(3):                          # where the rest vertices are not the template's, by a few millimetres
+    """Move the joints, which are combinations of the rest vertices, to wanted positions (J, 3)."""
+    for _ in range(3):                          # repeated, as rest vertices differ from the template's by millimetres
         shift = wanted - model.joint_regressor @ model.rest
         shift[0] = 0
         old = model.skeleton
@@ -180,7 +206,7 @@ def _with_joints_at(model: SkinningModel, wanted: np.ndarray) -> SkinningModel:
 
 def _with_correctives(model: SkinningModel, poses: np.ndarray, bodies: np.ndarray, config: SkinConfig
                       ) -> SkinningModel:
-    """The model with rest vertices and correctives regressed on the unposed bodies."""
+    """Regress rest vertices and correctives on the unposed bodies, with the best penalty."""
     unposed = np.stack([_unpose(model, p, y) for p, y in zip(poses, bodies, strict=True)])
     features = corrective_features(model.skeleton, poses, config.correctives)
     joints = _acting_joints(model)
@@ -193,7 +219,7 @@ def _with_correctives(model: SkinningModel, poses: np.ndarray, bodies: np.ndarra
 
 
 def _unpose(model: SkinningModel, pose: np.ndarray, body: np.ndarray) -> np.ndarray:
-    """(N, 3) rest vertices, correctives included, that the model with its joints carries onto a body."""
+    """Find the rest vertices (N, 3), correctives included, that the model with its joints carries onto a body."""
     y = model.vertices(pose)
     left = body - y
     moved = np.einsum("nij,nj->ni", invert_blended(model.blend_rotations(pose)), left - left.mean(axis=0))
@@ -201,29 +227,29 @@ def _unpose(model: SkinningModel, pose: np.ndarray, body: np.ndarray) -> np.ndar
 
 
 def corrective_features(skeleton: Skeleton, poses: np.ndarray, correctives: bool) -> PoseFeatures:
-    """For every joint a constant, and its kept twist directions where there are correctives."""
+    """Build features: for every joint a constant, and its main twist directions where there are correctives."""
     J = len(skeleton.parents)
-    # rad²: twist directions of smaller variance correct nothing
+    # twist directions with a variance below 0.01 rad² are not observed well enough to learn from
     directions = principal_directions(poses, 0.01) if correctives else [np.zeros((3, 0))] * J
     return part_features(skeleton, LinearLift(), directions, [[j] for j in range(J)])
 
 
 def _acting_joints(model: SkinningModel) -> np.ndarray:
-    """(N, J) how freely each joint corrects each vertex: the nearest ones of its heaviest part, fading."""
+    """Compute how freely each joint corrects each vertex, (N, J): two near joints, fading over the surface."""
     x, joints = model.template.vertices, model.skeleton.joints
     acting = np.zeros(model.weights.shape)
     for p, of_part in enumerate(model.skeleton.joints_of_part):
-        mine, near = np.flatnonzero(model.weights.argmax(axis=1) == p), np.array(of_part, dtype=np.int64)
-        far = np.linalg.norm(x[mine, None] - joints[near], axis=2)
+        vertices, near = np.flatnonzero(model.weights.argmax(axis=1) == p), np.array(of_part, dtype=np.int64)
+        far = np.linalg.norm(x[vertices, None] - joints[near], axis=2)
         # two joints correct a vertex: those of its heaviest part that are nearest to it
-        acting[mine[:, None], near[np.argsort(far, axis=1, kind="stable")[:, :2]]] = 1
-    # over 5 cm of surface a joint's correctives give way to another's; vertices of one of eight levels share a solve
+        acting[vertices[:, None], near[np.argsort(far, axis=1, kind="stable")[:, :2]]] = 1
+    # correctives fade over 5 cm of surface; rounding to eight levels lets vertices share one solve
     return np.round(8 * diffuse(model.template, acting, 0.05)) / 8
 
 
 def _regress(features: PoseFeatures, poses: np.ndarray, unposed: np.ndarray, acting: np.ndarray, ridge: float
              ) -> tuple[np.ndarray, np.ndarray, float]:
-    """Rest vertices (N, 3), correctives (C, N, 3) and the error of left-out poses, root mean square in metres."""
+    """Regress rest vertices (N, 3) and correctives (C, N, 3); also return the RMS error of left-out poses, metres."""
     free = np.flatnonzero(features.constant == 0)
     delta, M = features.evaluate(poses)[:, free], len(poses)
     rest, correctives = np.empty(unposed.shape[1:]), np.zeros((len(free), *unposed.shape[1:]), dtype=np.float32)
@@ -231,22 +257,23 @@ def _regress(features: PoseFeatures, poses: np.ndarray, unposed: np.ndarray, act
     total = 0.0
     joint = features.part[free]
     for g, freedom in enumerate(kinds):
-        used, mine = np.flatnonzero(freedom[joint] > 0), which.ravel() == g
-        target, scale = unposed[:, mine].reshape(M, -1), freedom[joint[used]]
+        used, vertices = np.flatnonzero(freedom[joint] > 0), which.ravel() == g
+        target, scale = unposed[:, vertices].reshape(M, -1), freedom[joint[used]]
         centre, middle = delta[:, used].mean(axis=0) * scale, target.mean(axis=0)
         X = delta[:, used] * scale - centre
+        # ridge regression, and its leave-one-out residuals in closed form
         solver = ridge_operator(X, M * ridge)
         slope, hat = solver @ target, X @ solver + 1 / M
         left = (target - middle - X @ slope) / np.maximum(1 - np.diag(hat), 1e-6)[:, None]
         total += float((left**2).sum())
-        rest[mine] = (middle - centre @ slope).reshape(-1, 3)
-        correctives[np.ix_(used, mine)] = (scale[:, None] * slope).reshape(len(used), mine.sum(), 3)
+        rest[vertices] = (middle - centre @ slope).reshape(-1, 3)
+        correctives[np.ix_(used, vertices)] = (scale[:, None] * slope).reshape(len(used), vertices.sum(), 3)
     return rest, correctives, float(np.sqrt(total / (M * len(rest))))
 
 
 def _learn_people(model: SkinningModel, shapes: np.ndarray, components: int, work: ProgressShares) -> SkinningModel:
-    """The model with the shape components of people (P, N, 3) whose poses are fitted and undone in turn."""
-    people_rounds = 3  # of fitting the poses of the other people and undoing them
+    """Learn the shape components of people (P, N, 3), whose poses are fitted and undone in turn."""
+    people_rounds = 3  # rounds of fitting the people's poses with the shapes learned so far, and undoing them
     share = 1 / (people_rounds * len(shapes))
     for k in range(people_rounds):
         quick = FitConfig(polish=0, n_betas=min(20, model.n_betas) or None)
@@ -261,5 +288,5 @@ def _learn_people(model: SkinningModel, shapes: np.ndarray, components: int, wor
 
 def _unpose_person(model: SkinningModel, fitter: ShapeFitter | PoseFitter, body: np.ndarray,
                    _: ProgressShares) -> np.ndarray:
-    """(N, 3) rest vertices of a person whose pose is fitted."""
+    """Fit the pose of a person and compute the rest vertices (N, 3)."""
     return model.unpose(body, fitter.fit(body).pose)

@@ -1,4 +1,4 @@
-"""What is measured: names, the standards' terms, and what people measure."""
+"""The catalogue of measurements: names, terms of the standards, and plausible ranges."""
 from __future__ import annotations
 
 from collections.abc import Sequence
@@ -10,8 +10,8 @@ from typing import Literal
 class Measure:
     """One measurement.
 
-    `standard` is the term and the standard that it comes from, with its number there where two sources tell the same;
-    `low` and `high`, in its `unit`, metres or kilograms, bound what people measure.
+    `standard` is the term and its standard, with its number where two sources agree. `low` and `high`, in the `unit`,
+    metres or kilograms, bound the values of people.
     """
 
     name: str
@@ -22,16 +22,16 @@ class Measure:
 
     @property
     def exact(self) -> float:
-        """The difference up to which a value is met: a fifth of a millimetre, 20 grams."""
+        """The tolerance within which a value counts as reached: 0.2 mm, 20 grams."""
         return 2e-4 if self.unit == "m" else 0.02
 
     @property
     def shown(self) -> tuple[float, str, int]:
-        """How people read it: the factor to that unit, its name, and decimals."""
+        """How to show a value: the factor to the shown unit, its name, and decimals."""
         return (1000.0, "mm", 0) if self.unit == "m" else (1.0, "kg", 1)
 
     def text(self, value: float) -> str:
-        """A value as people read it.
+        """Format a value with its usual unit.
 
         Examples
         --------
@@ -77,7 +77,7 @@ CATALOGUE: dict[str, Measure] = {measure.name: measure for measure in (
 
 
 def plain(name: str) -> str:
-    """The name of a measurement without its side.
+    """Return the name of a measurement without its side.
 
     Examples
     --------
@@ -88,7 +88,7 @@ def plain(name: str) -> str:
 
 
 def find_measurements(word: str) -> Sequence[str]:
-    """The measurements that a user's word means: `waist` the waist girth, `thigh` both thighs' girths.
+    """Find the measurements that a user's word means: `waist` is the waist girth, `thigh` both thigh girths.
 
     Raises
     ------
@@ -98,8 +98,8 @@ def find_measurements(word: str) -> Sequence[str]:
     said = word.strip().lower().replace("-", "_").replace(" ", "_")
     for base in (said, f"{said}_girth", *(f"{said.removesuffix(f'_{side}')}_girth_{side}"
                                           for side in ("left", "right"))):
-        found = [name for name in CATALOGUE if name in (base, f"{base}_left", f"{base}_right")]
-        if found:
-            return found
+        matches = [name for name in CATALOGUE if name in (base, f"{base}_left", f"{base}_right")]
+        if matches:
+            return matches
     there = ", ".join(dict.fromkeys(map(plain, CATALOGUE)))
     raise ValueError(f"no measurement {word!r}; there are: {there} (those of limbs also with _left or _right)")

@@ -1,4 +1,4 @@
-"""Tapes found once on a template, from its landmarks and its shape."""
+"""Find where tapes run on a template, once, from its landmarks and its shape."""
 from __future__ import annotations
 
 import contextlib
@@ -15,30 +15,44 @@ from .marks import BodyLandmarks, body_landmarks
 from .section import Carried, SectionCurve, direction, mean_of, section, tape
 from .tapes import Extent, Found, Girth, Height, Span, Straight, Tapes, Way, Weight
 
-BAND = 0.10                          # how far from its place on the template a tape may run, along the surface
+BAND = 0.10                          # metres along the surface, for 1.75 m: a tape stays this near to its template place
 
 
-class _NotThere(ValueError):
-    """A measurement that a template does not have, and why."""
+class _NotThereError(ValueError):
+    """A measurement that cannot be found on a template; the message says why."""
 
 
 def find_tapes(template: Mesh, landmarks: Mapping[str, int]) -> Tapes:
     """Find every measurement on a template that stands upright, its arms away from the body.
 
-    Waist, bust and ends of limbs are at landmarks; hips and calves are the widest, neck and wrists the narrowest
-    sections between two of them.
+    Waist, bust and ends of limbs are at landmarks. Hips and calves are the widest, neck and wrists the narrowest
+    sections between two landmarks.
 
     Parameters
     ----------
-    template : Mesh
-    landmarks : name to vertex
-        Under the names of the built-in people, the SCAPE meshes or CAESAR. Toes and heels are needed, and one of
-        head or neck; what begins at another landmark is left out where there is none.
+    template : Mesh, metres
+        A person, for example a model's template.
+    landmarks : dict of str to int
+        Vertices by the names of the built-in people, the SCAPE meshes or CAESAR. Toes and heels are needed, and one
+        landmark of head or neck. Measurements without their landmarks are left out.
+
+    Returns
+    -------
+    Tapes
+        `found` and `missing` measurements by name; for `measure`.
 
     Raises
     ------
     ValueError
         A landmark that is needed is missing.
+
+    Examples
+    --------
+    >>> from model import load_built_in_model
+    >>> model = load_built_in_model()
+    >>> tapes = find_tapes(model.template, model.info["landmarks"])
+    >>> "waist_girth" in tapes.found, len(tapes.missing)
+    (True, 0)
     """
     finder = _Finder(body_landmarks(template, landmarks))
     found, missing = dict[str, Found](), dict[str, str]()
@@ -47,7 +61,7 @@ def find_tapes(template: Mesh, landmarks: Mapping[str, int]) -> Tapes:
             found[name] = find()
         except KeyError as lacking:
             missing[name] = f"the template has no landmark '{str(lacking)[1:-1]}'"
-        except _NotThere as problem:
+        except _NotThereError as problem:
             missing[name] = str(problem)
     return Tapes(template, finder.places.axes, found, missing, finder.limbs)
 
@@ -60,13 +74,13 @@ class _Finder:
         self.graph = SurfaceGraph(self.mesh)
         height = self.mesh.vertices @ places.up
         self.floor, self.stature = float(height.min()), float(np.ptp(height))
-        # lengths above are those of somebody of 1.75 m
+        # lengths in this module are those of a person of 1.75 m
         self.scale = self.stature / 1.75
         self.limbs: dict[str, tuple[Carried, Carried]] = {}
         self.done: dict[str, Girth] = {}
 
     def recipes(self) -> Iterator[tuple[str, Callable[[], Found]]]:
-        """Names and how each is found, in the order in which they build on each other."""
+        """Yield names and how each is found, in the order in which they build on each other."""
         p = self.places
         yield "stature", lambda: Height(None)
         yield "neck_height", lambda: Height(self.point("neck back"))
@@ -95,7 +109,7 @@ class _Finder:
         yield "weight", self.weight
 
     def leg(self, side: str) -> Iterator[tuple[str, Callable[[], Found]]]:
-        """Of one leg, from above."""
+        """Yield the recipes of one leg, from above."""
         p, knee, heel = self.places, (f"{side} knee", f"{side} knee inside"), f"{side} heel"
         yield f"thigh_girth_{side}", lambda: self.keep(f"thigh_girth_{side}", self.level(
             0.5 * (p.at(*knee) + p.at(f"{side} hip")), p.height("crotch") - 0.04 * self.scale), None, BAND)
@@ -105,7 +119,7 @@ class _Finder:
         yield f"foot_length_{side}", lambda: self.foot(side)
 
     def arm(self, side: str) -> Iterator[tuple[str, Callable[[], Found]]]:
-        """Of one arm, from above."""
+        """Yield the recipes of one arm, from above."""
         p, elbow = self.places, (f"{side} elbow outside", f"{side} elbow inside")
         shoulder, tip = f"{side} shoulder", f"{side} middle finger"
         yield f"upper_arm_girth_{side}", lambda: self.keep(f"upper_arm_girth_{side}", None, self.upper_arm(side))
@@ -117,42 +131,40 @@ class _Finder:
         yield f"hand_length_{side}", lambda: Straight(self.girth(f"wrist_girth_{side}").centre, self.point(tip))
 
     def weight(self) -> Weight:
-        """Of a surface that encloses a volume."""
+        """Return the weight, for a surface that encloses a volume."""
         if not self.mesh.is_closed:
-            raise _NotThere("the template is open, so it has no volume")
+            raise _NotThereError("the template is open, so it has no volume")
         return Weight()
 
     def point(self, *names: str) -> Carried:
-        """The mean of landmarks, all of which must be there."""
+        """Return the mean of landmarks, all of which must be there."""
         for name in names:
             self.places.at(name)
         return mean_of(*(self.places.of[name] for name in names))
 
     def loop(self, origin: np.ndarray, normal: np.ndarray) -> SectionCurve:
-        """The closed section by a plane that is nearest to a point (3,) of it, at most 12 cm away."""
+        """Find the closed section by a plane nearest to its point `origin` (3,), at most 12 cm away."""
         curves = section(self.mesh.vertices, self.mesh.faces, origin, normal)
         far = [np.linalg.norm(curve.at(self.mesh.vertices).mean(axis=0) - origin) for curve in curves]
         if not curves or min(far) > 0.12 * self.scale:
-            raise _NotThere("the template has no section there")
+            raise _NotThereError("the template has no section there")
         best = curves[int(np.argmin(far))]
         if not best.closed:
-            raise _NotThere("a hole of the template crosses it")
+            raise _NotThereError("a hole of the template crosses it")
         return best
 
     def level(self, near: np.ndarray, height: float) -> tuple[np.ndarray, np.ndarray]:
-        """The level plane at a height, metres, through the point above or below `near` (3,)."""
+        """Return the level plane at a height, metres, through the point above or below `near` (3,)."""
         up = self.places.up
         return near + (height - near @ up) * up, up
 
     def along(self, start: np.ndarray, end: np.ndarray, share: float) -> tuple[np.ndarray, np.ndarray]:
-        """The plane across the line between two points (3,)."""
+        """Return the plane across the line between two points (3,), at a share of the way."""
         return start + share * (end - start), (end - start) / np.linalg.norm(end - start)
 
     def keep(self, name: str, plane: tuple[np.ndarray, np.ndarray] | None, axis: tuple[Carried, Carried] | None,
              band: float = 0.07, under_arms: bool = False) -> Girth:
-        """The girth in a plane (a point of it, its normal), or across an axis where that begins; carried by its
-        centroid.
-        """
+        """Store the girth in a plane (a point, its normal), or across the beginning of an axis, by its centroid."""
         vertices = self.mesh.vertices
         if axis is None:
             assert plane is not None, "a girth without an axis has a plane"
@@ -162,6 +174,7 @@ class _Finder:
             first = self.loop(*(plane or (axis[0].at(vertices), normal)))
             ring = self.loop(first.centroid(vertices).at(vertices), normal)
         centre = ring.centroid(vertices)
+        # triangles near the section along the surface, without the arms where the tape runs under them
         far, _ = self.graph.nearest(np.unique(ring.edges))
         near = (far <= band * self.scale)[self.mesh.faces].any(axis=1)
         if under_arms:
@@ -172,51 +185,52 @@ class _Finder:
 
     @cached_property
     def arms(self) -> np.ndarray:
-        """(N,) bool, the vertices of the arms: nearer to the elbow, along the surface, than the armpit is.
+        """(N,) bool, the vertices of arms and shoulders.
 
-        And of the shoulders: above the armpit and farther out, where a tape at the nipples comes on some bodies.
+        Arms are nearer to the elbow, along the surface, than the armpit is. Shoulders are above the armpit and farther
+        out; on some bodies a tape at the nipples reaches them.
         """
-        found = np.zeros(len(self.mesh.vertices), dtype=bool)
+        marked = np.zeros(len(self.mesh.vertices), dtype=bool)
         for side, sign in (("left", 1), ("right", -1)):
             elbow, armpit = (self.places.of.get(f"{side} {name}") for name in ("elbow inside", "armpit"))
             if elbow is not None and armpit is not None:
                 far = self.graph.distances(elbow)
                 up, left, _ = self.places.axes @ (self.mesh.vertices - self.mesh.vertices[armpit]).T
-                found |= (far < far[armpit]) | ((up > 0) & (sign * left > 0))
-        return found
+                marked |= (far < far[armpit]) | ((up > 0) & (sign * left > 0))
+        return marked
 
     def girth(self, name: str) -> Girth:
-        """One that was found before."""
+        """Return a girth that was found before."""
         if name not in self.done:
-            raise _NotThere(f"the template has no {name.replace('_', ' ')}")
+            raise _NotThereError(f"the template has no {name.replace('_', ' ')}")
         return self.done[name]
 
     def extreme(self, name: str, sign: int, plane: Callable[[float], tuple[np.ndarray, np.ndarray]],
                 axis: tuple[Carried, Carried] | None = None, band: float = 0.07) -> Girth:
-        """The girth of the longest (1) or shortest (-1) tape among 25 planes, over t from 0 to 1."""
+        """Find the girth of the longest (1) or shortest (-1) tape among 25 planes, over t from 0 to 1."""
         planes = [plane(float(t)) for t in np.linspace(0, 1, 25)]
         lengths = [sign * self.around(self.loop(*at), at[1]) for at in planes]
         return self.keep(name, planes[int(np.argmax(lengths))], axis, band)
 
     def around(self, ring: SectionCurve, normal: np.ndarray) -> float:
-        """Metres of a tape around a section."""
+        """Compute the length, metres, of a tape around a section."""
         points = ring.at(self.mesh.vertices)
         hull = points[tape(points, normal)]
         return float(np.linalg.norm(hull - np.roll(hull, 1, axis=0), axis=1).sum())
 
     def trunk(self, name: str, height: float) -> Girth:
-        """A level girth of the trunk."""
+        """Find a level girth of the trunk."""
         return self.keep(name, self.level(self.middle(), height), None, BAND, name != "waist_girth")
 
     def middle(self) -> np.ndarray:
-        """A point (3,) on the axis of the trunk."""
+        """Return a point (3,) on the axis of the trunk."""
         p = self.places
         if "back" in p.of:
             return p.at("navel", "back")
         return p.at("left hip", "right hip", "left shoulder", "right shoulder")
 
     def waist(self) -> Girth:
-        """At the landmarks, else the narrowest of the trunk."""
+        """Find the waist at its landmarks, else the narrowest section of the trunk."""
         p = self.places
         if {"left waist", "right waist"} <= set(p.of):
             return self.trunk("waist_girth", p.height("left waist", "right waist"))
@@ -225,16 +239,16 @@ class _Finder:
             self.middle(), low + (0.35 + 0.5 * t) * (high - low)), None, BAND)
 
     def hips(self) -> Girth:
-        """The widest from the crotch up to two thirds of the way to the waist."""
+        """Find the widest section from the crotch up to two thirds of the way to the waist."""
         p = self.places
         low, high = p.height("crotch"), p.height("left waist", "right waist", "navel")
         return self.extreme("hip_girth", 1, lambda t: self.level(
             self.middle(), low + (0.12 + 0.55 * t) * (high - low)), None, BAND)
 
     def neck(self) -> Girth:
-        """The narrowest across the neck, which leans forward: over planes that sink towards the throat, too.
+        """Find the narrowest section across the neck, also among planes that sink towards the throat.
 
-        Level ones run into the jaw of people who hold their chins low.
+        The neck leans forward, and level planes meet the jaw of people who hold their chins low.
         """
         front, back = self.point("neck front"), self.point("neck back")
         foot, ears = self.point("neck front", "neck back"), self.point("left ear", "right ear")
@@ -249,29 +263,29 @@ class _Finder:
 
         tried = []
         for lean in (0.0, 0.125, 0.25, 0.375, 0.5):
-            with contextlib.suppress(_NotThere):
+            with contextlib.suppress(_NotThereError):
                 tried.append(leaning(lean))
         if not tried:
-            raise _NotThere("the template has no whole neck")
+            raise _NotThereError("the template has no whole neck")
         self.done["neck_girth"] = min(tried, key=lambda one: one[0])[1]
         return self.done["neck_girth"]
 
     def limb(self, name: str, start: np.ndarray, end: np.ndarray, first: float, second: float
              ) -> tuple[Carried, Carried]:
-        """The axis of a limb: centroids of two sections between its ends."""
+        """Find the axis of a limb: the centroids of two sections between its ends."""
         low, high = (self.loop(*self.along(start, end, share)).centroid(self.mesh.vertices)
                      for share in (first, second))
         self.limbs[name] = low, high
         return low, high
 
     def upper_arm(self, side: str) -> tuple[Carried, Carried]:
-        """From its middle, or as soon as the armpit is passed, to the elbow."""
+        """Find the axis of the upper arm: from its middle, or as soon as the armpit is passed, to the elbow."""
         p = self.places
         for share in (0.5, 0.56, 0.62, 0.68):
-            with contextlib.suppress(_NotThere):
+            with contextlib.suppress(_NotThereError):
                 return self.limb(f"{side} upper arm", p.at(f"{side} shoulder"),
                                  p.at(f"{side} elbow outside", f"{side} elbow inside"), share, 0.95)
-        raise _NotThere("the upper arm lies against the trunk on the template")
+        raise _NotThereError("the upper arm lies against the trunk on the template")
 
     def shin(self, side: str) -> tuple[Carried, Carried]:
         p = self.places
@@ -282,10 +296,7 @@ class _Finder:
         return Span(girth, axis)
 
     def behind(self, girth: Girth, name: str) -> np.ndarray:
-        """Vertices of a girth's section that lie beyond its plane, seen from a landmark, so that a way crosses it.
-
-        Where triangles are as long as a forearm those before it are anywhere on the way.
-        """
+        """Find the vertices of a girth's section beyond its plane, seen from a landmark, so that a path crosses it."""
         vertices = self.mesh.vertices
         normal = self.places.up if girth.axis is None else direction(girth.axis, vertices)
         ring, origin = np.unique(girth.ring.edges), girth.centre.at(vertices)
@@ -293,31 +304,31 @@ class _Finder:
         return ring[side * ((vertices[ring] - origin) @ normal) < 0]
 
     def nearest(self, girth: Girth, name: str) -> int:
-        """The vertex behind a girth that is nearest to a landmark, along the surface."""
+        """Find the vertex behind a girth that is nearest to a landmark, along the surface."""
         ring = self.behind(girth, name)
         return int(ring[self.graph.distances(self.point(name).vertices[0])[ring].argmin()])
 
     def at_back(self, girth: Girth, name: str) -> int:
-        """The vertex behind a girth in the middle of the back."""
+        """Find the vertex behind a girth in the middle of the back."""
         ring = self.behind(girth, name)
         apart = self.mesh.vertices[ring] - girth.centre.at(self.mesh.vertices)
         back = apart @ self.places.axes[2] < 0
         return int(ring[back][np.abs(apart[back] @ self.places.axes[1]).argmin()])
 
     def way(self, *stations: str | int, until: str | None = None) -> Way:
-        """Along the surface, over landmarks or vertices, and as far as the plane of a girth."""
+        """Find a path along the surface, over landmarks or vertices, as far as the plane of a girth."""
         vertices = [int(self.point(s).vertices[0]) if isinstance(s, str) else s for s in stations]
         faces = []
         for start, end in itertools.pairwise(vertices):
-            over = self.graph.distances(np.array([start, end])).sum(axis=0)        # of ways over each vertex
+            over = self.graph.distances(np.array([start, end])).sum(axis=0)        # path lengths over each vertex
             if not np.isfinite(over[start]):
-                raise _NotThere("no way along the surface joins its ends")
-            # triangles count that a way crosses which is up to 5 cm longer than the shortest
+                raise _NotThereError("no way along the surface joins its ends")
+            # triangles on paths up to 5 cm longer than the shortest: other bodies may take these
             faces.append(self.mesh.faces[(over[self.mesh.faces] <= over[start] + 0.05 * self.scale).any(axis=1)])
         return Way(tuple(vertices), tuple(faces), until)
 
     def foot(self, side: str) -> Extent:
-        """From heel to toes, of what is low and on that side."""
+        """Find the foot length, from heel to toes, of the low vertices on that side."""
         p = self.places
         heel, toe = self.point(f"{side} heel"), self.point(f"{side} toe")
         middle = 0.5 * (p.at(f"{side} heel") + p.at(f"{side} toe"))

@@ -1,4 +1,4 @@
-"""The landmarks that measurements begin from, and the axes of the body that they tell."""
+"""The landmarks that measurements use, and the axes of the body."""
 from __future__ import annotations
 
 from collections.abc import Mapping
@@ -10,7 +10,7 @@ from scanprep.geometry.landmark_names import translate_landmarks
 from scanprep.geometry.mesh import Mesh
 
 FEET = tuple(f"{side} {name}" for side in ("left", "right") for name in ("toe", "heel"))
-# Where tapes begin. No waist: without its landmarks it is the narrowest place, which says more than a guess.
+# landmarks of measurements. The waist is left out: without its landmarks it is the narrowest section of the trunk.
 MEASURED = (*FEET, "top of head", "neck front", "neck back", "navel", "back", "crotch",
             *(f"{side} {name}" for side in ("left", "right") for name in (
                 "ear", "shoulder", "armpit", "nipple", "hip", "knee", "knee inside", "elbow outside", "elbow inside",
@@ -19,7 +19,7 @@ MEASURED = (*FEET, "top of head", "neck front", "neck back", "navel", "back", "c
 
 @dataclass(frozen=True, eq=False)
 class BodyLandmarks:
-    """Named vertices of a template, and which way is up, left and ahead: the rows of `axes` (3, 3)."""
+    """Named vertices of a template, and its directions up, left and ahead: the rows of `axes` (3, 3)."""
 
     mesh: Mesh
     of: Mapping[str, int]
@@ -30,21 +30,21 @@ class BodyLandmarks:
         return self.axes[0]
 
     def at(self, *names: str) -> np.ndarray:
-        """The mean (3,), metres, of some landmarks; KeyError where none of them is known."""
+        """Compute the mean (3,), metres, of some landmarks; KeyError where none of them is known."""
         known = [self.of[name] for name in names if name in self.of]
         if not known:
             raise KeyError(" and ".join(names))
         return self.mesh.vertices[known].mean(axis=0)
 
     def height(self, *names: str) -> float:
-        """Of the mean of some landmarks along `up`, metres."""
+        """Compute the height of the mean of some landmarks along `up`, metres."""
         return float(self.at(*names) @ self.up)
 
 
 def body_landmarks(mesh: Mesh, landmarks: Mapping[str, int]) -> BodyLandmarks:
-    """The landmarks of a template, by our names, and its axes.
+    """Collect the landmarks of a template, by our names, and its axes.
 
-    Up is the axis of coordinates along which head or neck are above the feet, where the body stands along one.
+    Up is the coordinate axis along which head or neck are above the feet, or else their direction.
 
     Raises
     ------
@@ -61,6 +61,7 @@ def body_landmarks(mesh: Mesh, landmarks: Mapping[str, int]) -> BodyLandmarks:
     feet, head = (np.mean([at[name] for name in names if name in at], axis=0) for names in (FEET, above))
     up = (head - feet) / np.linalg.norm(head - feet)
     axis = int(np.abs(up).argmax())
+    # within 14 degrees of a coordinate axis the body stands along it
     if np.abs(up[axis]) > 0.97:
         up = np.sign(up[axis]) * np.eye(3)[axis]
     ahead = at["left toe"] - at["left heel"] + at["right toe"] - at["right heel"]

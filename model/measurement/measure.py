@@ -1,4 +1,4 @@
-"""Measurements of one body: the tapes of its template laid on it."""
+"""Measurements of one body, by the tapes of its template."""
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
@@ -9,31 +9,39 @@ import numpy as np
 from scanprep.geometry import rotations
 from scanprep.geometry.mesh import Mesh
 
-from .reading import NotMeasured, Reading, Standing, read_measurement
+from .reading import NotMeasuredError, Reading, Standing, read_measurement
 from .tapes import Tapes
 
-# Chosen on half views of the ten even people of `tests/benchmarks/measures.py`, which tells how far the odd ones agree.
-MOST, SHARE = 0.010, 0.02            # metres, and of the value: more is an error of the pose, which repose takes away
-MANY = 2000                          # vertices, whose distances from each other are 100 megabytes
+# chosen on half views of the ten even people of `tests/benchmarks/measures.py`; the odd ones test them
+MOST, SHARE = 0.010, 0.02            # metres, and share of the value: larger errors are of the pose, not of the shape
+MANY = 2000                          # vertices: the matrix of their distances takes 100 megabytes with intermediates
 
 
 @dataclass(frozen=True, eq=False)
 class Measurements:
-    """What was measured of a body.
+    """Result of `measure`.
 
     Attributes
     ----------
-    readings : dict of name to Reading
-        In the order of the catalogue.
-    missing : dict of name to str
-        Why a measurement is not there.
+    readings : dict of str to Reading
+        Every measurement with its curve and derivative, in the order of the catalogue.
+    missing : dict of str to str
+        Why a measurement could not be taken.
     turned : tuple of str
-        Limbs that are far from the standard pose: what was measured there is of that pose.
+        Limbs that are far from the standard pose, in which their measurements differ.
     axes : (3, 3) float
         Unit vectors up, left and ahead of the body.
-    errors : dict of name to float
-        Expected error, root mean square, in the unit of the measurement; of the weight alone where none is known of
-        the vertices.
+    errors : dict of str to float
+        Expected error, root mean square, in the unit of the measurement. Only of the weight where no errors of the
+        vertices are given.
+
+    Examples
+    --------
+    >>> from model import find_tapes, load_built_in_model, measure
+    >>> model = load_built_in_model()
+    >>> result = measure(model.template, find_tapes(model.template, model.info["landmarks"]), only=["weight"])
+    >>> list(result.values), result.turned
+    (['weight'], ())
     """
 
     readings: Mapping[str, Reading]
@@ -52,26 +60,32 @@ def measure(body: Mesh | np.ndarray, tapes: Tapes, axes: np.ndarray | None = Non
             expected_error: np.ndarray | None = None, only: Iterable[str] | None = None) -> Measurements:
     """Measure a body that has the triangles of a template and stands about as it does.
 
-    A girth is the length of a tape, the convex hull of a plane section: level for trunk, head and thighs, across the
-    limb or the neck for the others. Its centre and axis are carried by the vertices, the plane is cut anew. Ways along
-    the surface are exact shortest paths over the same landmarks. The weight is that of the volume.
+    A girth is the length of a tape: the convex hull of a plane section. The plane is level for trunk, head and thighs,
+    and across the limb or neck for the others. The vertices carry its centre and axis, and the section is cut anew.
+    Lengths along the surface are exact shortest paths over the same landmarks. The weight follows from the volume.
 
     Parameters
     ----------
     body : Mesh or (N, 3) float, metres
+        The body, in the topology of the template.
     tapes : Tapes
-        Of the template, see `find_tapes`.
+        Tapes of the template, see `find_tapes`.
     axes : (3, 3) float, optional
-        Unit vectors up, left and ahead of the body; found by laying the template on it when not given.
+        Unit vectors up, left and ahead of the body; by default from aligning the template with it.
     expected_error : (N,) float, metres, optional
-        Of the vertices, as of a `Completion`.
-    only : names, optional
-        Of the catalogue; all when not given.
+        Expected errors of the vertices, for example of a `Completion`.
+    only : iterable of str, optional
+        Names of the catalogue; by default all.
+
+    Returns
+    -------
+    Measurements
+        Values in metres, the weight in kilograms, with curves, missing measurements and expected errors.
 
     Raises
     ------
     ValueError
-        Vertices of another count or not finite.
+        Another number of vertices, or vertices that are not finite.
 
     Examples
     --------
@@ -91,7 +105,7 @@ def measure(body: Mesh | np.ndarray, tapes: Tapes, axes: np.ndarray | None = Non
     for name in tapes.found if only is None else [n for n in only if n in tapes.found]:
         try:
             readings[name] = read_measurement(tapes.found[name], standing, tapes)
-        except NotMeasured as problem:
+        except NotMeasuredError as problem:
             missing[name] = str(problem)
     errors = {name: reading.unknown if expected_error is None else measurement_error(reading, vertices, expected_error)
               for name, reading in readings.items() if expected_error is not None or reading.unknown}
@@ -99,7 +113,7 @@ def measure(body: Mesh | np.ndarray, tapes: Tapes, axes: np.ndarray | None = Non
 
 
 def laid_on(template: Mesh, vertices: np.ndarray) -> np.ndarray:
-    """The turn (3, 3) that lays the template on a body (N, 3): of trunk and legs, as limbs that moved lose weight."""
+    """Find the rotation (3, 3) from the template to a body (N, 3); limbs that moved lose weight, round by round."""
     weights, R = template.vertex_areas, np.eye(3)
     for _ in range(20):
         here, there = (points - np.average(points, axis=0, weights=weights)
@@ -110,44 +124,46 @@ def laid_on(template: Mesh, vertices: np.ndarray) -> np.ndarray:
 
 
 def stands(vertices: np.ndarray, tapes: Tapes) -> bool:
-    """Whether a body (N, 3) stands so nearly as its template that it need not be brought into that pose."""
+    """Return whether a body (N, 3) stands nearly as its template, so that it need not be reposed."""
     mesh = tapes.template.with_vertices(vertices)
-    # half of what changes little is not worth the millimetres that another pose costs
+    # half the usual limits: for smaller turns, reposing costs more millimetres than it saves
     return not find_turned_limbs(tapes, Standing(mesh, tapes.axes @ laid_on(tapes.template, vertices).T), 0.5)
 
 
 def find_turned_limbs(tapes: Tapes, body: Standing, share: float = 1.0) -> tuple[str, ...]:
-    """Limbs that point elsewhere than on the template, by more than a share of what changes little, in words."""
-    found = []
-    turned = {"upper arm": 30.0, "forearm": 35.0, "shin": 15.0}  # degrees from the standard pose that change little
+    """Describe limbs that point elsewhere than on the template, by more than a share of the usual limits."""
+    texts = []
+    # degrees from the standard pose that change measurements little
+    turned = {"upper arm": 30.0, "forearm": 35.0, "shin": 15.0}
     for name, (first, second) in tapes.limbs.items():
         ways = [(second.at(vertices) - first.at(vertices)) @ axes.T for vertices, axes in (
             (tapes.template.vertices, tapes.axes), (body.vertices, body.axes))]
         cosine = ways[0] @ ways[1] / (np.linalg.norm(ways[0]) * np.linalg.norm(ways[1]))
         angle = float(np.degrees(np.arccos(np.clip(cosine, -1, 1))))
         if angle > share * turned[name.split(" ", 1)[1]]:
-            found.append(f"the {name} is turned by {angle:.0f} degrees from the standard pose")
-    return tuple(found)
+            texts.append(f"the {name} is turned by {angle:.0f} degrees from the standard pose")
+    return tuple(texts)
 
 
 def measurement_error(reading: Reading, vertices: np.ndarray, expected: np.ndarray) -> float:
-    """Expected error, root mean square, of a measurement, in its unit.
+    """Compute the expected error of a measurement, root mean square, in its unit.
 
-    The derivative by the vertices is applied to errors that are alike in all directions and go together over some
-    way, so that a girth sums them up and a distance feels its ends; sliding along the skin comes on top, and what no
-    surface tells.
+    The derivative by the vertices is applied to errors that are isotropic and correlated over 10 cm. Errors by sliding
+    along the skin are added, and those that no surface shows.
 
     Parameters
     ----------
     reading : Reading
+        The measurement.
     vertices : (N, 3) float, metres
+        The body that was measured.
     expected : (N,) float, metres
         Root mean square error of each vertex, as of a completion.
     """
     most = MOST if reading.unknown else min(MOST, SHARE * reading.value)
     pull = np.minimum(expected[reading.vertices], most)[:, None] * reading.force / np.sqrt(3)
-    # of thousands of vertices those of one cube are taken together: within a quarter of the reach errors are alike
-    reach = 0.10  # metres, over which errors of the surface go together
+    # with thousands of vertices, those in one cube of a quarter of the reach are summed: their errors are alike
+    reach = 0.10  # metres over which errors of the surface are correlated
     cubes = vertices if len(np.unique(reading.vertices)) < MANY else np.floor(vertices / (0.25 * reach))
     first, place = np.unique(cubes[reading.vertices], axis=0, return_index=True, return_inverse=True)[1:]
     place = place.ravel()
@@ -156,5 +172,5 @@ def measurement_error(reading: Reading, vertices: np.ndarray, expected: np.ndarr
     points = vertices[reading.vertices[first]]
     together = np.exp(-0.5 * (np.linalg.norm(points[:, None] - points, axis=2) / reach)**2)
     variance = np.einsum("id,ij,jd->", sums, together, sums)
-    # metres that a section may lie beside its place along the part, or a landmark
+    # a section or landmark may be 3 mm from its right place along the part
     return float(np.sqrt(max(variance, 0) + (0.003 * reading.slope)**2 + reading.unknown**2))

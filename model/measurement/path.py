@@ -1,4 +1,4 @@
-"""Shortest ways along the surface, and where they run."""
+"""Shortest paths along the surface."""
 from __future__ import annotations
 
 import numpy as np
@@ -9,33 +9,38 @@ from .section import SectionCurve, chain_length
 
 
 def shortest_path(body: np.ndarray, faces: np.ndarray, start: int, end: int) -> tuple[float, SectionCurve]:
-    """Exact length, metres, of the shortest way along triangles from one vertex to another, and the way itself.
+    """Find the shortest path along triangles from one vertex to another: its exact length, metres, and its curve.
 
     Parameters
     ----------
     body : (N, 3) float, metres
+        Vertices.
     faces : (F, 3) int
-        The triangles that the way may cross.
+        The triangles that the path may cross.
+    start : int
+        Vertex at which the path starts.
+    end : int
+        Vertex at which it ends.
 
     Raises
     ------
     ValueError
-        No way leads there.
+        No path leads there.
     """
     import igl
     from scipy.optimize import minimize
 
-    used, few = np.unique(faces, return_inverse=True)
-    few, vertices = few.reshape(-1, 3), np.ascontiguousarray(body[used])
+    used, local = np.unique(faces, return_inverse=True)
+    local, vertices = local.reshape(-1, 3), np.ascontiguousarray(body[used])
     places = np.searchsorted(used, [start, end])
     if not np.array_equal(used[np.minimum(places, len(used) - 1)], [start, end]) or start == end:
         raise ValueError(f"vertices {start} and {end}: expected two that the triangles join")
     none = np.zeros(0, dtype=np.int64)
-    far = igl.exact_geodesic(vertices, few, places[:1], none, np.arange(len(used)), none)
+    far = igl.exact_geodesic(vertices, local, places[:1], none, np.arange(len(used)), none)
     if not 0 < far[places[1]] < 1e6:                                       # 0, or a huge number, where no way leads
         raise ValueError(f"vertices {start} and {end}: no way along the surface joins them, there is a gap")
-    edges, share = _descent(Mesh(vertices, few), far, int(places[0]), int(places[1]))
-    # the shortest way across the same edges: a convex problem in the places on them
+    edges, share = _descent(Mesh(vertices, local), far, int(places[0]), int(places[1]))
+    # trace the path down the distances, then shorten it across the same edges: a convex problem in the points on them
     first, along = vertices[edges[:, 0]], vertices[edges[:, 1]] - vertices[edges[:, 0]]
 
     def length(s: np.ndarray) -> tuple[float, np.ndarray]:
@@ -48,7 +53,7 @@ def shortest_path(body: np.ndarray, faces: np.ndarray, start: int, end: int) -> 
 
 
 def _descent(mesh: Mesh, far: np.ndarray, start: int, end: int) -> tuple[np.ndarray, np.ndarray]:
-    """Edges (m, 2) and places (m,) on them that lead from `end` down the distances `far` (N,) from `start`."""
+    """Trace a path from `end` down the distances `far` (N,) from `start`: edges (m, 2) and shares (m,) along them."""
     of_vertex: dict[int, list[int]] = {}
     for face, corners in enumerate(mesh.faces.tolist()):
         for corner in corners:
@@ -62,6 +67,7 @@ def _descent(mesh: Mesh, far: np.ndarray, start: int, end: int) -> tuple[np.ndar
             break
         here = (1 - s) * mesh.vertices[a] + s * mesh.vertices[b]
         below = (1 - s) * far[a] + s * far[b]
+        # of all points on the other edges of the triangles here, the one with the shortest way to the start
         best = (np.inf, a, b, s)
         for three in corners:
             for c, d in ((three[0], three[1]), (three[1], three[2]), (three[2], three[0])):

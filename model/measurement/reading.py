@@ -12,19 +12,19 @@ from .path import shortest_path
 from .section import Carried, SectionCurve, bulge, chain_length, direction, section, tape, tape_length
 from .tapes import Extent, Found, Girth, Height, Span, Straight, Tapes, Way, Weight
 
-# Kilograms of a person per cubic metre inside the skin. Tissue has 1,030 to 1,080, by the share of fat; lungs that are
-# half full hold 3 litres of air. The spread is that of fat (7% of the weight: 1.5%) and of air (0.8 of 78 litres: 1%).
+# kilograms of a person per cubic metre inside the skin, and spread. Tissue has 1,030 to 1,080, depending on fat; lungs
+# half full hold 3 litres of air. The spread is that of fat (7% of the weight: 1.5%) and air (0.8 of 78 litres: 1%).
 DENSITY, DENSITY_SPREAD = 985.0, 0.02
-ENDS = np.sqrt(2.0)                  # slope of what has two landmarks, which slide each for itself
+ENDS = np.sqrt(2.0)                  # slope of a distance between two landmarks that slide independently
 
 
-class NotMeasured(ValueError):
-    """A measurement that cannot be taken of a body, and why."""
+class NotMeasuredError(ValueError):
+    """A measurement that cannot be taken of a body; the message says why."""
 
 
 @dataclass(frozen=True, eq=False)
 class Standing:
-    """A body in the triangles of a template, and the unit vectors up, left and ahead, the rows of `axes` (3, 3)."""
+    """A body in the triangles of a template; the rows of `axes` (3, 3) are unit vectors up, left and ahead."""
 
     mesh: Mesh
     axes: np.ndarray
@@ -38,10 +38,9 @@ class Standing:
 class Reading:
     """One measurement of a body.
 
-    `value`, metres, or kilograms of a weight; `curve` (m, 3), metres, where the tape runs, its points one after the
-    other; `vertices` (k,) and `force` (k, 3) its derivative by them, of which one may come several times; `slope`,
-    metres per metre, what sliding its plane along the part, or its landmarks along the skin, changes; `unknown`, in
-    its unit, a standard deviation of what no surface tells.
+    `value` is in metres, or kilograms for a weight; `curve` (m, 3), metres, is the line of the tape. `force` (k, 3) is
+    the derivative by `vertices` (k,), which may repeat. `slope`, metres per metre, is the change when its plane slides
+    along the part, or its landmarks along the skin. `unknown` is the standard deviation of what no surface shows.
     """
 
     value: float
@@ -52,17 +51,17 @@ class Reading:
     unknown: float = 0.0
 
     def along(self, moves: np.ndarray) -> np.ndarray:
-        """Change (...,) of the value by moves (N, 3, ...) of all vertices."""
+        """Compute the change (...,) of the value by moves (N, 3, ...) of all vertices."""
         return np.einsum("kd,kd...->...", self.force, moves[self.vertices])
 
 
 @singledispatch
 def read_measurement(found: Found, body: Standing, tapes: Tapes) -> Reading:
-    """One measurement of a body.
+    """Take one measurement of a body.
 
     Raises
     ------
-    NotMeasured
+    NotMeasuredError
         A hole where the tape runs.
     """
     raise TypeError(f"expected a measurement, got {type(found).__name__}")
@@ -79,9 +78,9 @@ def _girth(found: Girth, body: Standing, tapes: Tapes) -> Reading:
 
 @dataclass(frozen=True, eq=False)
 class _Cut:
-    """The section of a girth, its plane, its points (m, 3), and which of them the tape touches, in order.
+    """The section of a girth: its plane, its points (m, 3), and those that the tape touches, in order (`hull`).
 
-    `change` (m, 3): how the bulge at a point changes as it goes along its edge, by the share of the edge.
+    `change` (m, 3) is the derivative of the bulge at a point by its share along its edge.
     """
 
     curve: SectionCurve
@@ -93,26 +92,27 @@ class _Cut:
 
 
 def _plane(found: Girth, body: Standing) -> tuple[np.ndarray, np.ndarray]:
-    """A point (3,) of the plane of a girth, and its normal."""
+    """Compute a point (3,) of the plane of a girth, and its normal."""
     normal = body.axes[0] if found.axis is None else direction(found.axis, body.vertices)
     return found.centre.at(body.vertices), normal
 
 
 def _cut_girth(found: Girth, body: Standing, tapes: Tapes) -> _Cut:
-    """The section of a girth, cut anew by its carried plane; NotMeasured where it is not closed.
+    """Cut the section of a girth by its carried plane; NotMeasuredError where it is not closed.
 
-    A thigh or an upper arm is measured as near to the trunk as it is on its own: its plane moves on in twelve steps, of
-    4 mm for somebody of 1.75 m. Where arms are left out the pieces of the section are taken together.
+    Thigh and upper arm are measured as near to the trunk as they are separate. Their plane moves away in up to twelve
+    steps of 4 mm for a person of 1.75 m. Where arms are left out, the pieces of the section are joined.
     """
     vertices, (origin, normal) = body.vertices, _plane(found, body)
     step = 0.004 * (np.ptp(vertices @ body.axes[0]) / 1.75) * found.aside * normal
     for place in (origin + tried * step for tried in range(12 if found.aside else 1)):
         curves = section(vertices, found.faces, place, normal)
         if not curves:
-            raise NotMeasured("its plane meets nothing there")
+            raise NotMeasuredError("its plane meets nothing there")
+        # open curves that end at the border of the mesh mean a hole there; of the others the nearest counts
         ends = np.concatenate([c.edges[[0, -1]] for c in curves if not c.closed] or [np.zeros((0, 2), int)])
         if np.isin(ends, body.mesh.boundary_vertices).all(axis=1).any():
-            raise NotMeasured("a hole of the mesh crosses it")
+            raise NotMeasuredError("a hole of the mesh crosses it")
         far = [float(np.linalg.norm(c.at(vertices).mean(axis=0) - place)) for c in curves]
         curve = curves[int(np.argmin(far))]
         if found.under_arms and not curve.closed:
@@ -123,15 +123,15 @@ def _cut_girth(found: Girth, body: Standing, tapes: Tapes) -> _Cut:
             off, change = bulge(vertices, body.mesh.vertex_normals, curve)
             points = curve.at(vertices) + off
             return _Cut(curve, place, normal, points, change, tape(points, normal))
-    raise NotMeasured("its plane runs out of the part it goes around")
+    raise NotMeasuredError("its plane runs out of the part it goes around")
 
 
 def _section_derivative(found: Girth, cut: _Cut, chosen: np.ndarray, pull: np.ndarray, body: Standing
                         ) -> tuple[np.ndarray, np.ndarray, float]:
-    """What vertices add where they pull at points of a section, the plane moving with them.
+    """Carry a derivative by points of a section to the vertices, with the plane that moves along.
 
-    `chosen` (m,) points of the section, `pull` (m, 3) the derivative by them; vertices (k,), their force (k, 3), and
-    the derivative by moving the plane along its normal. What normals change at the bulge is left out.
+    `chosen` (m,) are points of the section and `pull` (m, 3) the derivative by them. Returns vertices (k,), their force
+    (k, 3), and the derivative by a shift of the plane along its normal. The effect of normals on the bulge is left out.
     """
     vertices, edges, share = body.vertices, cut.curve.edges[chosen], cut.curve.share[chosen]
     along = vertices[edges[:, 1]] - vertices[edges[:, 0]]
@@ -144,9 +144,10 @@ def _section_derivative(found: Girth, cut: _Cut, chosen: np.ndarray, pull: np.nd
 
 def _plane_pull(found: Girth, out: np.ndarray, apart: np.ndarray, normal: np.ndarray, vertices: np.ndarray
                 ) -> tuple[np.ndarray, np.ndarray]:
-    """What vertices (k,) add, and their force (k, 3), where the plane of a girth takes points with it.
+    """Compute the derivative by the vertices that carry the plane of a girth: vertices (k,), force (k, 3).
 
-    `out` (m,) derivative by the place of each point along the normal, `apart` (m, 3) the points from the plane's.
+    `out` (m,) is the derivative by each point's shift along the normal; `apart` (m, 3) are the points relative to the
+    plane's.
     """
     ids, force = [found.centre.vertices], [found.centre.weights[:, None] * (out.sum() * normal)]
     if found.axis is not None:                                            # the plane turns with the limb
@@ -171,7 +172,7 @@ def _span(found: Span, body: Standing, tapes: Tapes) -> Reading:
 
 
 def _through(middle: np.ndarray, points: np.ndarray, way: np.ndarray) -> np.ndarray:
-    """Points (n, 3) moved onto the line through the middle (3,) along a unit vector (3,)."""
+    """Project points (n, 3) onto the line through a point (3,) along a unit vector (3,)."""
     return middle + np.outer((points - middle) @ way, way)
 
 
@@ -222,7 +223,7 @@ def _way(found: Way, body: Standing, tapes: Tapes) -> Reading:
         try:
             length, curve = shortest_path(body.vertices, faces, start, end)
         except ValueError as problem:
-            raise NotMeasured(str(problem)) from None
+            raise NotMeasuredError(str(problem)) from None
         points = curve.at(body.vertices)
         _, pull = chain_length(points)
         if k == last and found.until is not None:
@@ -240,13 +241,13 @@ def _way(found: Way, body: Standing, tapes: Tapes) -> Reading:
 
 
 def _until(girth: Girth, way: SectionCurve, body: Standing) -> tuple[float, np.ndarray, tuple[np.ndarray, np.ndarray]]:
-    """What a way, its last point first, lacks as far as the plane of a girth, straight on; or has too much.
+    """Extend a path straight on to the plane of a girth, or cut it there; its last point comes first.
 
-    Metres; the points that it then has; vertices (k,) and their force (k, 3).
+    Returns the change of length, metres, the points of the new path, and vertices (k,) with their force (k, 3).
     """
     (origin, normal), points = _plane(girth, body), way.at(body.vertices)
     last = way.edges[0, 0]
-    # metres at the end of a way that tell where it goes on
+    # the direction is that of the last 5 cm
     k = int((np.linalg.norm(points - points[0], axis=1) > 0.05).argmax()) or len(points) - 1
     before = way.edges[k, int(way.share[k] > 0.5)]                        # a vertex, as points of ways slide
     ahead = points[0] - body.vertices[before]

@@ -1,7 +1,7 @@
-"""Where a measurement stands among people who were measured: percentiles of ANSUR II.
+"""Percentiles of measurements among the people of the ANSUR II survey.
 
-The table holds, for women and men, mean, standard deviation and quantiles of 22 measures and age, and how the measures
-go together. `tests/people/ansur2.py` made it from the rows of the survey, which are not here.
+The table holds mean, standard deviation and quantiles of 22 measures and age for women and men, and their correlation.
+`tests/people/ansur2.py` made it from the rows of the survey, which are not included.
 """
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ from ..shape_statistics import WORDS, Sex
 from .catalogue import plain
 
 TABLE = Path(__file__).with_name("ansur2.json")
-# Measures that bodies here and people of the survey have alike. Of every seventh man of SPRING they are 0.1 to 0.7
-# standard deviations from the survey on average. Others are taken elsewhere on the body and 0.8 to 3.1 off: ends of
-# hands, arms and shoulders, crotch, level of the waist, neck; heads wear hair or caps, hips stand with feet apart.
+# Measures that are taken here as in the survey. For every seventh man of SPRING they are 0.1 to 0.7 standard deviations
+# from the survey on average. The others are 0.8 to 3.1 off, since they are taken elsewhere: ends of hands, arms and
+# shoulders, crotch, level of the waist, neck. Heads wear hair or caps, and hips stand with feet apart.
 ALIKE = ("stature", "neck_height", "shoulder_height", "chest_girth", "waist_girth", "hip_girth", "thigh_girth",
          "calf_girth", "wrist_girth", "chest_depth", "foot_length", "weight")
 
@@ -56,7 +56,7 @@ class Survey:
 
 @lru_cache(maxsize=2)
 def survey(sex: Sex, path: Path = TABLE) -> Survey:
-    """The table of a sex, from a file of `tests/people/ansur2.py`.
+    """Read the table of a sex from a file of `tests/people/ansur2.py`.
 
     Raises
     ------
@@ -66,27 +66,28 @@ def survey(sex: Sex, path: Path = TABLE) -> Survey:
     if sex not in WORDS:
         raise ValueError(f"sex: expected 'female' or 'male', got {sex!r}")
     table = json.loads(path.read_text(encoding="utf-8"))
-    mine = table[sex]
-    return Survey(mine["people"], tuple(table["measures"]), np.array(mine["mean"]), np.array(mine["sd"]),
-                  np.array(table["shares"]), np.array(mine["quantiles"]), np.array(mine["correlation"]))
+    own = table[sex]
+    return Survey(own["people"], tuple(table["measures"]), np.array(own["mean"]), np.array(own["sd"]),
+                  np.array(table["shares"]), np.array(own["quantiles"]), np.array(own["correlation"]))
 
 
 def percentiles(values: Mapping[str, float], sex: Sex) -> dict[str, float]:
-    """Which share of the people of a sex, in per cent, has less of each measure that the survey takes as we do.
+    """Compute the percentile of each measure among the people of a sex, where the survey measures as we do.
 
-    Between two quantiles the normal score is linear in the value, and beyond the outermost as steep as between the
-    last two. Soldiers of 17 to 58 years were measured: they are leaner and younger than everybody.
+    Between two quantiles the normal score is linear in the value, and it is extrapolated beyond the outermost ones. The
+    survey measured soldiers of 17 to 58 years, who are leaner and younger than the population.
 
     Parameters
     ----------
     values : name to float
         Metres, and kilograms of the weight, by names of `CATALOGUE`.
     sex : {"female", "male"}
+        With whom to compare.
 
     Returns
     -------
     dict of name to float
-        Of the measures of `ALIKE`; from 0.1 to 99.9, as nothing is known further out.
+        Percentiles of the measures in `ALIKE`, from 0.1 to 99.9, as nothing is known further out.
 
     Examples
     --------
@@ -109,7 +110,7 @@ def percentiles(values: Mapping[str, float], sex: Sex) -> dict[str, float]:
 
 
 def ordinal(percentile: float) -> str:
-    """A percentile in words: 52nd, above 99th, below 1st.
+    """Format a percentile: 52nd, above 99th, below 1st.
 
     Examples
     --------

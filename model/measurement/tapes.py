@@ -13,11 +13,11 @@ from .section import Carried, SectionCurve
 
 @dataclass(frozen=True, eq=False)
 class Girth:
-    """A tape around some part: the plane through `centre`, along `up` where there is no axis, else across the axis.
+    """A tape around a part, in the plane through `centre`: level where there is no axis, else across the axis.
 
-    `faces` (F', 3) are the triangles around its place on the template: arms and other legs are none of them.
-    `under_arms`: where they end at the arms the tape runs straight on, under the armpit. `aside`: where the plane meets
-    the trunk or the other leg it moves on, along its normal (1) or against it (-1); 0 if it stays.
+    `faces` (F', 3) are the triangles near it on the template, without arms or the other leg. With `under_arms`, the
+    tape runs straight on where they end at the arms. Where the plane meets the trunk or the other leg, it moves along
+    its normal (`aside` 1) or against it (-1); 0 if it stays.
     """
 
     centre: Carried
@@ -38,14 +38,14 @@ class Span:
 
 @dataclass(frozen=True, eq=False)
 class Height:
-    """Height of the highest vertex of some, or of a carried point, above the floor."""
+    """Height above the floor of a carried point, or of the highest vertex."""
 
     top: Carried | None
 
 
 @dataclass(frozen=True, eq=False)
 class Straight:
-    """The straight way between two carried points."""
+    """The straight distance between two carried points."""
 
     first: Carried
     second: Carried
@@ -53,7 +53,7 @@ class Straight:
 
 @dataclass(frozen=True, eq=False)
 class Extent:
-    """How long some vertices (k,) are along the level direction from one carried point to another."""
+    """The extent of some vertices (k,) along the level direction from one carried point to another."""
 
     vertices: np.ndarray
     first: Carried
@@ -62,10 +62,10 @@ class Extent:
 
 @dataclass(frozen=True, eq=False)
 class Way:
-    """Shortest ways along the surface from vertex to vertex, one after the other, and the triangles for each.
+    """Shortest paths along the surface from vertex to vertex, one after the other, and the triangles for each.
 
-    `until`: the last way goes on, or ends before, where it meets the plane of a girth: a vertex of the template's
-    section may lie 2 cm from the section of another body.
+    With `until`, the last path is extended or cut to the plane of a girth, since a vertex of the template's section may
+    be 2 cm from the section of another body.
     """
 
     vertices: tuple[int, ...]
@@ -75,7 +75,7 @@ class Way:
 
 @dataclass(frozen=True, eq=False)
 class Weight:
-    """What the volume of a closed surface weighs."""
+    """The weight of a person, from the volume of a closed surface."""
 
 
 Found = Girth | Span | Height | Straight | Extent | Way | Weight

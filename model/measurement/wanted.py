@@ -1,4 +1,4 @@
-"""The most probable body with given measurements, and what is likely of all others."""
+"""The most probable body with given measurements, and likely ranges of all others."""
 from __future__ import annotations
 
 from collections.abc import Mapping
@@ -13,7 +13,7 @@ from .measure import measure
 from .reading import DENSITY_SPREAD
 from .tapes import Tapes
 
-OFTEN = 1.6449                       # standard deviations within which 90% of people are
+OFTEN = 1.6449                       # standard deviations within which 90% of a Gaussian are
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,14 +54,14 @@ class WantedBody:
 
     @property
     def missed(self) -> dict[str, float]:
-        """What was reached less what was wanted, where they are apart; of both sides alike their mean."""
+        """Reached minus wanted values, where they differ by more than the tolerance."""
         off = {name: self.reached[name] - value for name, value in self.wanted.items()}
         return {name: off[name] for sides in alike(self.wanted) for name in sides
                 if abs(np.mean([off[one] for one in sides])) > CATALOGUE[name].exact}
 
     @property
     def oddest(self) -> str:
-        """The measurement that was asked for and fits least to the others."""
+        """The wanted measurement that fits least with the others."""
         def off(name: str) -> float:
             low, high = self.usual[name]
             return abs(self.wanted[name] - 0.5 * (low + high)) / (high - low)
@@ -70,9 +70,9 @@ class WantedBody:
 
 
 def alike(wanted: Mapping[str, float]) -> list[list[str]]:
-    """The names of wanted measurements, those of left and right together where they are to be the same.
+    """Group the names of wanted measurements: left and right together where they should be the same.
 
-    No body has both to a fraction of a millimetre: the triangles of its sides differ.
+    No body has both sides equal to a fraction of a millimetre, since the triangles of its sides differ.
     """
     groups = dict[tuple[str, float], list[str]]()
     for name, value in wanted.items():
@@ -81,16 +81,16 @@ def alike(wanted: Mapping[str, float]) -> list[list[str]]:
 
 
 def check_wanted(given: Mapping[str, float]) -> dict[str, float]:
-    """Metres and kilograms by names of the catalogue, of a user's words.
+    """Check a user's measurements and return metres and kilograms by names of the catalogue.
 
     Raises
     ------
     ValueError
-        What is unknown, or no person has; with the unit that it seems to be in.
+        An unknown name, or a value that no person has, with the unit that it seems to be in.
 
     Examples
     --------
-    >>> checked_wanted({"stature": 1.8, "weight": 78})
+    >>> check_wanted({"stature": 1.8, "weight": 78})
     {'stature': 1.8, 'weight': 78.0}
     """
     wanted = dict[str, float]()
@@ -117,28 +117,33 @@ def check_wanted(given: Mapping[str, float]) -> dict[str, float]:
 
 def body_with_measurements(model: BodyModel, tapes: Tapes, given: Mapping[str, float], sex: Sex | None = None
                            ) -> WantedBody:
-    """The most probable body that has some measurements, and what is likely of the others.
+    """Find the most probable body with given measurements, and likely ranges of the others.
 
-    The Gaussian of betas under linear conditions, with the derivative of every measurement made anew where the body
-    is, until they are met (Gauss-Newton). Measurements that contradict each other, or the model, are met as nearly as
-    they can be.
+    The betas have a Gaussian distribution, and measurements are linear conditions on them. The derivatives are computed
+    anew at each new body until the measurements are reached (Gauss-Newton). Measurements that contradict each other, or
+    the model, are reached as nearly as possible.
 
     Parameters
     ----------
     model : BodyModel
-        With shape components.
+        A model with shape components.
     tapes : Tapes
-        Of its template.
-    given : name to float
+        Tapes of its template, see `find_tapes`.
+    given : dict of str to float
         Metres, and kilograms of the weight; `waist` means the waist girth, `thigh` that of both thighs.
     sex : {"female", "male"}, optional
-        Of a model that tells women from men, as the built-in one does; without it the more probable sex is taken.
+        For a model that tells women from men, as the built-in one does; by default the more probable sex.
+
+    Returns
+    -------
+    WantedBody
+        Betas (K,), vertices (N, 3), reached values, and ranges of all other measurements.
 
     Raises
     ------
     ValueError
-        A model without shape components, a measurement that is unknown, that the template does not have, or that no
-        person has, a sex of a model that does not tell women from men.
+        A model without shape components, an unknown measurement, one that the template does not have, a value that no
+        person has, or a sex of a model that does not tell women from men.
 
     Examples
     --------
@@ -159,22 +164,22 @@ def body_with_measurements(model: BodyModel, tapes: Tapes, given: Mapping[str, f
     pose = np.zeros((len(model.skeleton.parents), 3))
     base, moves = model.vertices(pose, np.zeros(model.n_betas)), model.shape_jacobian(pose)
     of = [sex] if sex is not None or len(list_sexes(model)) < 2 else list(list_sexes(model))
-    found = []
+    candidates = []
     for one in of:
         people = shape_statistics(model, one)
         # betas = mean + root z: z are standard normal, and people of a sex are the model for what follows
         search = _Search(base + moves @ people.mean, moves @ people.root, tapes, wanted)
         z, values, S = search.nearest_to_mean()
-        found.append((search.log_density(z, values, S), search.body(z, S, people.mean + people.root @ z, one)))
-    best = max(found, key=lambda pair: pair[0])
-    return replace(best[1], sex_probability=1 / float(np.exp([density - best[0] for density, _ in found]).sum()))
+        candidates.append((search.log_density(z, values, S), search.body(z, S, people.mean + people.root @ z, one)))
+    best = max(candidates, key=lambda pair: pair[0])
+    return replace(best[1], sex_probability=1 / float(np.exp([density - best[0] for density, _ in candidates]).sum()))
 
 
 class _Search:
-    """Bodies of a Gaussian of people, z standard normal, and measurements that one is to have.
+    """The search over bodies of a Gaussian of people, z standard normal, for one with wanted measurements.
 
-    A row is a measurement, or the mean of both sides where they are to be the same, divided by what is exact, so that
-    metres and kilograms count alike.
+    A row is a measurement, or the mean of both sides where they should be the same, divided by its tolerance, so that
+    metres and kilograms are comparable.
     """
 
     def __init__(self, base: np.ndarray, moves: np.ndarray, tapes: Tapes, wanted: Mapping[str, float]) -> None:
@@ -182,7 +187,7 @@ class _Search:
         self.rows = alike(wanted)
         self.unit = np.array([CATALOGUE[sides[0]].exact for sides in self.rows])
         self.goal = np.array([wanted[sides[0]] for sides in self.rows]) / self.unit
-        # people of one volume weigh differently
+        # people of one volume differ in weight; other measurements have a tenth of their tolerance
         self.unknown = np.array([DENSITY_SPREAD * wanted[sides[0]] if sides == ["weight"] else 0.1 * unit
                                  for sides, unit in zip(self.rows, self.unit, strict=True)]) / self.unit
         mean = self.readings(np.zeros(moves.shape[2]))
@@ -191,20 +196,20 @@ class _Search:
         self.mean = mean
 
     def readings(self, z: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
-        """What is measured there (m,), and its derivative (m, K) by z; None where a tape does not close."""
-        found = measure(self.base + self.moves @ z, self.tapes, self.tapes.axes, only=self.wanted)
-        if len(found.readings) < len(self.wanted):
+        """Measure the body of z: rows (m,), and their derivative (m, K) by z; None where a tape does not close."""
+        result = measure(self.base + self.moves @ z, self.tapes, self.tapes.axes, only=self.wanted)
+        if len(result.readings) < len(self.wanted):
             return None
-        slopes = {name: reading.along(self.moves) for name, reading in found.readings.items()}
-        return (np.array([np.mean([found.values[name] for name in sides]) for sides in self.rows]) / self.unit,
+        slopes = {name: reading.along(self.moves) for name, reading in result.readings.items()}
+        return (np.array([np.mean([result.values[name] for name in sides]) for sides in self.rows]) / self.unit,
                 np.stack([np.mean([slopes[name] for name in sides], axis=0) for sides in self.rows])
                 / self.unit[:, None])
 
     def nearest_to_mean(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """z of least norm whose body has the measurements, or has them as nearly as it can; with m and S there.
+        """Find z of smallest norm whose body has the measurements, as nearly as possible; with m and S there.
 
-        z = Sᵀ (S Sᵀ)⁻¹ (goal - m + S z), the derivatives S and measurements m made anew at each z, less far where that
-        would be worse: a level tape that slides over a bust is anything but linear.
+        z = Sᵀ (S Sᵀ)⁻¹ (goal - m + S z), with derivatives S and measurements m computed anew at each z. Steps are
+        shortened where they would be worse: a level tape that slides over a bust is far from linear.
         """
         z, (values, S) = np.zeros(self.moves.shape[2]), self.mean
         for _ in range(40):
@@ -219,18 +224,18 @@ class _Search:
                 if there is not None and np.linalg.norm(self.goal - there[0]) < np.linalg.norm(off):
                     break
             else:
-                break                                                     # as near as it can be
+                break                                                     # no shorter step helps: as near as possible
             z, (values, S) = tried, there
         return z, values, S
 
     def log_density(self, z: np.ndarray, values: np.ndarray, S: np.ndarray) -> float:
-        """Logarithm of the density of people with the wanted measurements, which are linear around z."""
+        """Compute the log-density of people with the wanted measurements, which are linearised around z."""
         C = S @ S.T + np.diag(self.unknown**2)
         off = self.goal - values + S @ z
         return -0.5 * float(off @ np.linalg.solve(C, off) + np.linalg.slogdet(C)[1])
 
     def body(self, z: np.ndarray, S: np.ndarray, betas: np.ndarray, sex: Sex | None) -> WantedBody:
-        """What is told of the body of z."""
+        """Collect the results for the body of z."""
         from scipy.stats import chi2
 
         vertices = self.base + self.moves @ z
@@ -251,7 +256,7 @@ class _Search:
                           float(chi2.sf(far**2, free)), likely, self.usual(), sex)
 
     def usual(self) -> dict[str, tuple[float, float]]:
-        """Of each wanted measurement, between which values nine of ten people are who have the others."""
+        """Compute, for each wanted measurement, the range of nine of ten people who have the other ones."""
         values, S = self.mean
         C, off = S @ S.T + np.diag(self.unknown**2), self.goal - values
         what = np.array([plain(sides[0]) for sides in self.rows])
@@ -266,14 +271,14 @@ class _Search:
 
 
 def _not_too_far(S: np.ndarray, wanted: np.ndarray) -> np.ndarray:
-    """Sᵀ (S Sᵀ + λ)⁻¹ wanted: the z of least norm with S z = wanted, or of `FARTHEST` norm with S z nearest to it."""
+    """Compute Sᵀ (S Sᵀ + λ)⁻¹ wanted: the z of least norm with S z = wanted, or with norm 8 nearest to it."""
     from scipy.optimize import brentq
 
     squares, axes = np.linalg.eigh(S @ S.T)
     squares, along = np.maximum(squares, 0), axes.T @ wanted
 
     def size(logarithm: float) -> float:
-        # standard deviations, of all betas together: what no model is asked to reach
+        # 8 standard deviations, of all betas together, is the limit: no person is so far from the mean
         return float(np.sqrt(squares @ (along / (squares + np.exp(logarithm)))**2)) - 8.0
 
     least, most = np.log(0.01), np.log(squares.max() + np.abs(along).max()**2 + 1)

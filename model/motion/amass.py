@@ -1,7 +1,7 @@
-"""Motions of the SMPL family as AMASS has them: their joints, and a stand-in for the rest pose, which they do not hold.
+"""Motions of the SMPL family as AMASS stores them: their joints, and an assumed rest pose, which the files lack.
 
-The rest positions of that family's joints are in its model files, which have a licence of their own. A motion on a
-model that was imported from one of these is copied; for all others the rest is taken to be a T-pose.
+The rest positions of the joints are in the model files, which have licences of their own. On a model that was imported
+from such a file, motions are copied. For all other models the rest pose is assumed to be a T-pose.
 """
 from __future__ import annotations
 
@@ -16,6 +16,7 @@ from ..rig import joint_places, turn_up
 from .files import StoredMotion
 from .moving import MovingSkeleton
 
+# joints of the body, in the order of the poses, and their parents
 NAMES = ("pelvis", "left_hip", "right_hip", "spine1", "left_knee", "right_knee", "spine2", "left_ankle", "right_ankle",
          "spine3", "left_foot", "right_foot", "neck", "left_collar", "right_collar", "head", "left_shoulder",
          "right_shoulder", "left_elbow", "right_elbow", "left_wrist", "right_wrist")
@@ -32,20 +33,23 @@ UNCERTAIN = "a T-pose, stated: AMASS files do not hold theirs; 5 to 10 degrees u
 
 
 def t_pose() -> np.ndarray:
-    """(22, 3) metres: where the joints of the body are taken to be at rest."""
+    """Compute the assumed rest positions (22, 3), metres, of the joints of the body."""
     left = [name.replace("right_", "left_") for name in NAMES]
     mirror = [[-1 if name.startswith("right_") else 1, 1, 1] for name in NAMES]
     return np.array([_T_POSE[name] for name in left]) * np.array(mirror)
 
 
 def moving_body(motion: StoredMotion) -> tuple[MovingSkeleton, str]:
-    """The 22 joints of the body in a motion of the family, at rest in the T-pose, with y up; and which axis was up."""
+    """Build the 22 joints of the body in a motion of the family, with the T-pose at rest; also return the up axis.
+
+    The axes are turned so that y is up.
+    """
     if motion.poses.shape[1] < BODY:
         raise ValueError(f"poses: expected at least the {BODY} joints of the body, found {motion.poses.shape[1]}")
     rest = t_pose()
     tree = Skeleton(np.arange(BODY), PARENTS, rest, NAMES)
     R = tree.part_rotations(motion.poses[:, :BODY])
-    high = R[:, 0, :, 1].mean(axis=0)                    # where the trunk points; z is up, but for y in some files
+    high = R[:, 0, :, 1].mean(axis=0)                    # mean direction of the trunk; z is up, in some files y
     up = 1 if high[1] > abs(high[2]) + 0.3 else 2
     U = turn_up(up)
     offsets = rest - np.where(PARENTS[:, None] < 0, 0, rest[PARENTS])
@@ -54,8 +58,9 @@ def moving_body(motion: StoredMotion) -> tuple[MovingSkeleton, str]:
 
 
 def with_joints(poses: np.ndarray, count: int) -> np.ndarray:
-    """Poses (T, J, 3) of one model of the family with the joints of another: the body's own, and fingers if both have
-    them; the others rest.
+    """Convert poses (T, J, 3) to the joints of another model of the family.
+
+    The body is copied, and the fingers if both have them; the other joints rest.
     """
     T, J = poses.shape[:2]
     if J == count:

@@ -1,4 +1,4 @@
-"""BVH, read: a skeleton with its motion, as motion databases have it."""
+"""Read BVH: a skeleton with its motion, as in motion databases."""
 from __future__ import annotations
 
 import re
@@ -15,37 +15,56 @@ from scanprep.geometry.storage import LARGEST, StorageError, read_bytes, taking_
 
 from .moving import MovingSkeleton
 
-USUAL_RATE = 30.0                    # frames a second of a file that does not say: what most programs play it with
+USUAL_RATE = 30.0                    # frames a second of a file that does not say: most programs play it so
 
 
 def read_bvh(path: str | Path, unit: str, rate: float | None = None) -> MovingSkeleton:
     """Read a BVH file as programs write it.
 
-    Turns are taken in the order of the channels, each about axes that turn with the part; channels of scale are left
-    out. Position channels of some programs hold the change of the offset, of others the offset itself, changed: what
-    comes nearer to bones of constant length is taken. Those of the root are its place, unless bones hold changes. What
-    the file says wrongly of itself, and what was done about it, is told in a UserWarning each.
+    Rotations are taken in the order of the channels, each about axes that turn with the part. Scale channels are
+    ignored. Position channels hold the change of the offset in some programs, and the whole offset in others; the
+    reader chooses what gives bones of constant length. Those of the root are its position, unless bones hold changes.
+    Each error of the file that could be repaired gives a UserWarning.
 
     Parameters
     ----------
     path : str or Path
+        `.bvh` file.
     unit : "m", "cm", "mm" or "in"
-        Of the lengths, which the file does not say.
+        Unit of the lengths, which the file does not say.
     rate : float, optional
         Frames a second, where the file does not say or says it wrongly.
+
+    Returns
+    -------
+    MovingSkeleton
+        Names, offsets (J, 3), rotations (T, J, 3, 3) and positions (T, J, 3) in metres, in the axes of the file.
 
     Raises
     ------
     StorageError
-        Missing, or damaged: the error names the line; a file with the skeletons of several people.
+        The file is missing or damaged (the message names the line), or holds the skeletons of several people.
     ValueError
         An unknown unit.
 
     Examples
     --------
-    >>> read_bvh("walk.bvh", "cm").names[0]
-    'Hips'
+    >>> import tempfile
+    >>> text = '''HIERARCHY
+    ... ROOT Hips
+    ... { OFFSET 0 90 0 CHANNELS 6 Xposition Yposition Zposition Zrotation Xrotation Yrotation
+    ...   End Site { OFFSET 0 10 0 } }
+    ... MOTION
+    ... Frames: 1
+    ... Frame Time: 0.04
+    ... 0 90 0 0 0 0
+    ... '''
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     _ = Path(f"{folder}/stand.bvh").write_text(text)
+    ...     read_bvh(f"{folder}/stand.bvh", "cm")
+    MovingSkeleton(1 joints, 1 frames at 25 1/s)
     """
+    # hierarchy, then the table of channels, then rotations and positions by forward kinematics
     metre = metres_of(unit)
     data = read_bytes(path, "a BVH file")
     with taking_apart(path, "a BVH file"):
@@ -67,7 +86,7 @@ class _Words:
         self._row: list[str] = []
 
     def look(self, expected: str) -> str:
-        """The next word, which stays."""
+        """Return the next word without consuming it."""
         while not self._row:
             if self.line == len(self.lines):
                 raise StorageError(f"{self.path}: expected {expected}, the file ends at line {self.line}")
@@ -102,7 +121,7 @@ class _Words:
         return int(value)
 
     def said(self, key: str, expected: str) -> float:
-        """The number behind a key of words, with a colon and blanks between or not."""
+        """Read the number after a key of words, with or without colon and blanks."""
         self.look(f"{key}:")
         text = " ".join(self._row[::-1])
         found = re.match(key.replace(" ", r"\s*") + r"\s*:?\s*", text, re.IGNORECASE)
@@ -112,7 +131,7 @@ class _Words:
         return self.number(expected)
 
     def name(self) -> str:
-        """All words up to the opening brace."""
+        """Read all words up to the opening brace."""
         found: list[str] = []
         while (word := self.take("'{' after the name of a joint")) != "{":
             if word == "}" or len(found) > 20:
@@ -135,7 +154,7 @@ class _Joint(NamedTuple):
 
 
 def _read_hierarchy(words: _Words) -> tuple[list[_Joint], dict[int, list[float]]]:
-    """The joints of HIERARCHY, and the End Sites by the numbers of their joints."""
+    """Read the joints of HIERARCHY, and the End Sites by the numbers of their joints."""
     words.keyword("HIERARCHY")
     words.keyword("ROOT")
     names: set[str] = set()
@@ -151,7 +170,7 @@ def _read_hierarchy(words: _Words) -> tuple[list[_Joint], dict[int, list[float]]
         else:
             joints.append(_read_joint(words, above[-1], names))
             above.append(len(joints) - 1)
-            if len(above) > 500:                                  # more is no skeleton
+            if len(above) > 500:                                  # deeper trees are damaged files
                 raise words.wrong("at most 500 joints below each other", "more")
     if words.look("MOTION").lower() == "root":
         more = [line.split()[1] for line in words.lines[words.line - 1:] if re.match(r"\s*root\s+\S", line, re.I)]
@@ -183,12 +202,11 @@ def _read_joint(words: _Words, parent: int, names: set[str]) -> _Joint:
 
 
 def _forward_kinematics(joints: list[_Joint], table: np.ndarray, metre: float) -> tuple[np.ndarray, np.ndarray]:
-    """World rotations (T, J, 3, 3) and places (T, J, 3), metres, of the joints by their channels (T, C).
+    """Compute world rotations (T, J, 3, 3) and positions (T, J, 3), metres, of the joints from their channels (T, C).
 
-    Channels of position are the offset itself or its change. Bones tell which: their length is that of the offset. The
-    joints that carry the body through the room, the root and those to the first with several below it, are no bones:
-    theirs mean what those of most bones do, the place itself where no bone has any. A channel there that is always 0 is
-    no place.
+    Position channels are the offset itself or its change; whichever keeps bones at the length of the offset is right.
+    The joints from the root to the first branch move the body through space and have no fixed length. They follow the
+    majority of the bones, and are positions where no bone has such channels. Channels that are always 0 are changes.
     """
     T, J = len(table), len(joints)
     values = np.split(table, np.cumsum([len(joint.channels) for joint in joints])[:-1], axis=1)
@@ -200,6 +218,7 @@ def _forward_kinematics(joints: list[_Joint], table: np.ndarray, metre: float) -
             if kind == "position":
                 added[:, j, axis] += values[j][:, k]
                 instead[:, j, axis] = values[j][:, k]
+    # joints that carry the whole body: from the root to the first branch
     carriers = {0}
     while sum(joint.parent == max(carriers) for joint in joints) == 1:
         carriers.add(next(j for j, joint in enumerate(joints) if joint.parent == max(carriers)))
@@ -212,21 +231,21 @@ def _forward_kinematics(joints: list[_Joint], table: np.ndarray, metre: float) -
     for j in carriers:
         changes[j] = most or not values[j][:, places[j]].any()
     steps = metre * np.where(changes[:, None], added, instead)
-    # down the tree
+    # rotations and positions, parents first
     R, y = np.empty((T, J, 3, 3)), np.empty((T, J, 3))
     for j, (_, p, _, channels) in enumerate(joints):
         turned = [k for k, (kind, _) in enumerate(channels) if kind == "rotation"]
-        mine = np.broadcast_to(np.eye(3), (T, 3, 3))
+        own = np.broadcast_to(np.eye(3), (T, 3, 3))
         if turned:
             order = "".join("XYZ"[channels[k][1]] for k in turned)
-            mine = Rotation.from_euler(order, values[j][:, turned], degrees=True).as_matrix().reshape(T, 3, 3)
-        R[:, j] = mine if p < 0 else R[:, p] @ mine
+            own = Rotation.from_euler(order, values[j][:, turned], degrees=True).as_matrix().reshape(T, 3, 3)
+        R[:, j] = own if p < 0 else R[:, p] @ own
         y[:, j] = steps[:, j] if p < 0 else y[:, p] + np.einsum("tab,tb->ta", R[:, p], steps[:, j])
     return R, y
 
 
 def _read_motion(words: _Words, joints: list[_Joint], rate: float | None) -> tuple[np.ndarray, float]:
-    """The table (T, C) of MOTION and the frames a second."""
+    """Read the table (T, C) of MOTION and the frames a second."""
     words.keyword("MOTION")
     count = words.said("Frames", "the number of frames")
     time = words.said("Frame Time", "the seconds of a frame")
@@ -272,7 +291,7 @@ def _read_motion(words: _Words, joints: list[_Joint], rate: float | None) -> tup
 
 
 def _is_number(word: str) -> bool:
-    """Whether a word is a finite number, perhaps with a decimal comma."""
+    """Return whether a word is a finite number, perhaps with a decimal comma."""
     try:
         return abs(float(word.replace(",", "."))) <= LARGEST
     except ValueError:

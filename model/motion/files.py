@@ -1,4 +1,4 @@
-"""Motion files (`.npz`), ours and those of AMASS: the one place that reads them."""
+"""Read motion files (`.npz`), ours and those of AMASS."""
 from __future__ import annotations
 
 import warnings
@@ -16,16 +16,16 @@ from ..body import BodyModel
 from ..files import KINDS
 from .bvh import USUAL_RATE
 
-OURS = tuple(KINDS)                                  # what files of our models say they are made for
-FAMILY = ("smpl", "star", "supr")                    # how the names of the models begin whose motions AMASS holds
+OURS = tuple(KINDS)                                  # `surface_model_type` of motions of our models
+FAMILY = ("smpl", "star", "supr")                    # prefixes of `surface_model_type` of motions in AMASS
 JOINTS = (22, 24, 52, 55)                            # joints of these models: the body, with hands, fingers, face
 RATES = ("mocap_frame_rate", "mocap_framerate", "fps", "frame_rate", "framerate")
-# Pieces of poses, in their order, as AMASS names them and as the smplx library does, each with the numbers it has.
+# pieces of poses in their order, with the names of AMASS and of the smplx library, and their sizes
 _PIECES = ({"root_orient": 3, "global_orient": 3}, {"pose_body": 63, "body_pose": 63},
            {"pose_jaw": 3, "jaw_pose": 3}, {"pose_eye": 6, "leye_pose": 3}, {"reye_pose": 3},
            {"pose_hand": 90, "left_hand_pose": 45}, {"right_hand_pose": 45})
 _PLACES = ("trans", "transl")
-# What a motion of another program is, by its ending, and what to export there in its place.
+# motion files of other programs by their ending: what they are, and what to export instead
 _ROTATIONS = "holds rotations of segments and no markers; export BVH in its place, for scape animate"
 OTHER_MOTIONS = {
     ".fbx": "FBX: open it in Blender or MotionBuilder and export BVH, for scape animate",
@@ -49,28 +49,28 @@ class StoredMotion:
 
     @property
     def of_family(self) -> bool:
-        """Whether it is a motion of the SMPL family, as AMASS has them."""
+        """Whether this is a motion of the SMPL family, as in AMASS."""
         return self.made_for.lower().startswith(FAMILY) or (not self.made_for and self.poses.shape[1] in JOINTS)
 
 
 def is_motion(path: Path) -> bool:
-    """Whether an `.npz` file holds a motion."""
+    """Return whether an `.npz` file holds a motion."""
     names = storage.names_in(path, "a motion (.npz)")
     return "poses" in names or _whole_body(names)
 
 
 def _whole_body(names: Collection[str]) -> bool:
-    """Whether there are the pieces of a pose that every body has."""
+    """Return whether the pieces of a pose that every body has are there."""
     return all(any(name in names for name in piece) for piece in _PIECES[:2])
 
 
 def read_motion_file(path: str | Path, more: Collection[str] = (), parts: int | None = None,
                      rate: float | None = None) -> StoredMotion:
-    """A motion file: `poses`, `trans`, `mocap_frame_rate`, and `betas` if it has some.
+    """Read a motion file: `poses`, `trans`, `mocap_frame_rate`, and `betas` if it has some.
 
-    The names may be those of AMASS or of the smplx library (`global_orient`, `body_pose`, `transl`, `fps`). Without a
-    rate, 30 frames a second are assumed, with a warning. `more` are further arrays to read, `parts` how many a model
-    has, for the words of errors, `rate` frames a second where the file does not say or says it wrongly.
+    Names may be those of AMASS or of the smplx library (`global_orient`, `body_pose`, `transl`, `fps`). Without a rate,
+    30 frames a second are assumed, with a warning. `more` are further arrays to read; `parts` is the model's number of
+    parts, for messages; `rate` replaces the frames a second of the file.
 
     Raises
     ------
@@ -86,7 +86,7 @@ def read_motion_file(path: str | Path, more: Collection[str] = (), parts: int | 
     what, wanted = "a motion (.npz)", (
         "poses", *_PLACES, "betas", *RATES, *(name for piece in _PIECES for name in piece), *more)
     a = storage.load_arrays(path, what, wanted)
-    for name in ("gender", "surface_model_type"):        # of which some files hold objects; then they are left out
+    for name in ("gender", "surface_model_type"):        # pickled objects in some files: these are skipped
         try:
             a |= storage.load_arrays(path, what, (name,))
         except StorageError:
@@ -104,18 +104,18 @@ def read_motion_file(path: str | Path, more: Collection[str] = (), parts: int | 
 
 
 def _join_poses(a: dict[str, np.ndarray]) -> np.ndarray:
-    """(T, 3J) poses of their pieces: the body, and the face and hands where all of these are there as rotations.
+    """Join pieces to poses (T, 3J): the body, with face and hands where all are there as rotations.
 
-    Hands as a few components of a hand model, which only that model can expand, are left out.
+    Hands as components of a hand model are left out, since only that model can expand them.
     """
     root = next(a[name] for name in _PIECES[0] if name in a)
     T = root.size // 3
-    found = [(a[name].reshape(T, -1), size) for piece in _PIECES for name, size in piece.items() if name in a]
-    body = found[1][0]
+    pieces = [(a[name].reshape(T, -1), size) for piece in _PIECES for name, size in piece.items() if name in a]
+    body = pieces[1][0]
     if body.shape[1] == 69:                              # SMPL: the hands are two joints of the body
-        return np.concatenate([found[0][0], body], axis=1)
-    flat = np.concatenate([values for values, size in found if values.shape[1] == size], axis=1)
-    return flat if flat.shape[1] // 3 in JOINTS else np.concatenate([found[0][0], body], axis=1)
+        return np.concatenate([pieces[0][0], body], axis=1)
+    flat = np.concatenate([values for values, size in pieces if values.shape[1] == size], axis=1)
+    return flat if flat.shape[1] // 3 in JOINTS else np.concatenate([pieces[0][0], body], axis=1)
 
 
 def _restore_motion(path: Path, a: dict[str, np.ndarray], more: Collection[str], parts: int | None,
@@ -133,6 +133,7 @@ def _restore_motion(path: Path, a: dict[str, np.ndarray], more: Collection[str],
             raise ValueError(f"{name}: expected one number, found shape {np.shape(a[name])}")
         rate = float(a[name].item())
         Range(TINY).check(rate, name)
+    # poses, flat or by parts, and betas, one row or one for every frame
     T, shape = len(np.atleast_1d(a["poses"])), a["poses"].shape[1:]
     poses = storage.numbers(a, "poses", T, *shape)
     if not T or poses[0].size % 3 or not poses[0].size:
@@ -153,13 +154,13 @@ def _restore_motion(path: Path, a: dict[str, np.ndarray], more: Collection[str],
 
 
 def check_ours(path: str | Path, stored: StoredMotion, where: str = "") -> None:
-    """StorageError for a motion of models of another kind."""
+    """Raise StorageError for a motion of another kind of model."""
     if stored.made_for not in (*OURS, ""):
         raise StorageError(f"{path}: expected surface_model_type '{OURS[0]}', found '{stored.made_for}'{where}")
 
 
 def betas_for(path: str | Path, betas: np.ndarray | None, model: BodyModel) -> np.ndarray | None:
-    """Betas that a model has: trailing zeros say nothing; StorageError where there are others."""
+    """Cut betas to those of the model; only zeros may be cut, else StorageError."""
     if betas is None or len(betas) <= model.n_betas:
         return betas
     used = int(np.flatnonzero(betas).max(initial=-1)) + 1

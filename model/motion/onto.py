@@ -1,4 +1,4 @@
-"""A motion of any file on a model: its own as it is, those of other skeletons brought onto it."""
+"""Read a motion of any file for a model: its own motions as they are, others by retargeting."""
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
@@ -32,13 +32,13 @@ class BodyMotion:
     betas: np.ndarray | None         # (K,) of the body, None for the template's own
     rate: float                      # frames a second
     gender: str = "neutral"
-    how: str = "as it is"            # how it came onto the body
-    rest: str = ""                   # what is not certain about the rest of its own skeleton
-    brought: Retargeted | None = None    # what followed what, and how well, of a motion of another skeleton
+    how: str = "as it is"            # how the motion was transferred to the body
+    rest: str = ""                   # what is uncertain about the rest pose of its own skeleton
+    brought: Retargeted | None = None    # result of retargeting, for a motion of another skeleton
     fit: RetargetingError | None = None
 
     def at_rate(self, rate: float) -> BodyMotion:
-        """The motion with so many frames a second: joints turn the shortest way between frames, places go straight."""
+        """Resample the motion to a frame rate: rotations by the shortest way between frames, places linearly."""
         if not rate > 0:
             raise ValueError(f"rate: expected more than 0 frames a second, got {rate}")
         last = len(self.poses) - 1
@@ -52,7 +52,7 @@ class BodyMotion:
 
     @property
     def told(self) -> list[Metric]:
-        """For a table: how a motion of another skeleton came onto the body, and how far it is off."""
+        """Rows for a table: how a motion of another skeleton was retargeted, and its error."""
         if self.brought is None:
             return []
         off = self.fit and f", joint centres {MM * self.fit.distance:.0f} mm, segments {self.fit.angle:.1f}° off"
@@ -62,26 +62,43 @@ class BodyMotion:
 
 def read_motion(path: str | Path, model: BodyModel, subject: Subject | None = None, unit: str | None = None,
                 rate: float | None = None) -> BodyMotion:
-    """A motion file for a model: its own (`.npz`), AMASS (`.npz`) or BVH.
+    """Read a motion file for a model: its own (`.npz`), AMASS (`.npz`) or BVH.
 
-    A motion of the model's parts is taken as it is; one of its skeleton, or of a model of its family, is copied; of
-    another skeleton the segments point where they pointed (see `retarget`).
+    A motion of the model's parts is taken as it is. One of the same skeleton, or of a model of the same family, is
+    copied. A motion of another skeleton is retargeted: segments keep their directions, see `model.motion.retarget`.
 
     Parameters
     ----------
     path : str or Path
+        Motion file.
     model : BodyModel
+        The model to move.
     subject : Subject, optional
-        The body that moves; else that of the file's betas, and for motions of other skeletons the mean person.
+        The body that moves; by default that of the file's betas, and for other skeletons the mean person.
     unit : str, optional
-        Of the lengths in a BVH file, else centimetres. Travel is as long as the legs are, so it matters little.
+        Unit of the lengths in a BVH file, by default centimetres. Travel is scaled by the legs, so it matters little.
     rate : float, optional
         Frames a second, where the file does not say or says it wrongly.
+
+    Returns
+    -------
+    BodyMotion
+        `poses` (T, J, 3) in radians, `trans` (T, 3) in metres, `betas`, `rate` in frames a second.
 
     Raises
     ------
     StorageError
-        Missing, damaged, or of a skeleton that cannot be brought onto this one.
+        The file is missing, damaged, or of a skeleton that cannot be retargeted.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> from model import load_built_in_model
+    >>> arrays = {"poses": np.zeros((5, 48)), "trans": np.zeros((5, 3)), "mocap_frame_rate": 30.0}
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     np.savez(f"{folder}/stand.npz", **arrays)
+    ...     read_motion(f"{folder}/stand.npz", load_built_in_model()).poses.shape
+    (5, 16, 3)
     """
     path = Path(path)
     if path.suffix.lower() == ".bvh":
@@ -90,7 +107,7 @@ def read_motion(path: str | Path, model: BodyModel, subject: Subject | None = No
     stored = read_motion_file(path, parts=J, rate=rate)
     family = bool(model.info.get("family"))
     if stored.of_family and (stored.made_for or stored.poses.shape[1] != J or family):
-        if family:                                    # a model that was imported from it
+        if family:                                    # our model was imported from that family: same joints
             betas = betas_for(path, stored.betas, model) if subject is None else subject.betas
             return BodyMotion(with_joints(stored.poses, J), stored.trans, betas, stored.rate, stored.gender,
                               "pose by pose, of the same family")
@@ -108,7 +125,7 @@ def read_motion(path: str | Path, model: BodyModel, subject: Subject | None = No
 
 def _onto(path: Path, moving: MovingSkeleton, model: BodyModel, subject: Subject | None, uncertain: str = "",
           gender: str = "neutral") -> BodyMotion:
-    """A motion of another skeleton on a body, if none is given the mean person's."""
+    """Retarget a motion of another skeleton to a body, by default the mean person's."""
     subject = subject or model.subject(np.zeros(1) if model.n_betas else None)
     skeleton = replace(subject.skeleton, joints=subject.joints(np.zeros((len(subject.skeleton.parents), 3))))
     same = copy_motion(skeleton, subject.template, subject.vertices, moving)
@@ -120,19 +137,19 @@ def _onto(path: Path, moving: MovingSkeleton, model: BodyModel, subject: Subject
         uncertain = f"that of frame {frame}, in which it stands: the file has none of a person who does"
     try:
         pair = Pairing(skeleton, subject.vertices, moving)
-        found = retarget_pair(pair)
+        done = retarget_pair(pair)
     except ValueError as problem:
         raise StorageError(f"{path}: {problem}") from None
-    fit = measure_error(pair, found.poses, subject.joints(found.poses, found.trans))
-    return BodyMotion(found.poses, found.trans, subject.betas, found.rate, gender, "by the directions of the segments",
-                      uncertain, found, fit)
+    fit = measure_error(pair, done.poses, subject.joints(done.poses, done.trans))
+    return BodyMotion(done.poses, done.trans, subject.betas, done.rate, gender, "by the directions of the segments",
+                      uncertain, done, fit)
 
 
 def standing_rest(moving: MovingSkeleton) -> tuple[MovingSkeleton, int | None]:
-    """The skeleton at rest as in the frame in which trunk and legs are nearest to the vertical, and its number.
+    """Replace a rest pose that does not stand by the frame in which trunk and legs are most upright; return its number.
 
-    Some files have bones at rest that all lie along one axis. A skeleton that stands at rest, or never, is returned as
-    it is, and None. The vertical is y, as BVH says, or z where nobody stands along y.
+    In some files all bones lie along one axis at rest. A skeleton that stands at rest, or never stands, is returned
+    unchanged, with None. The vertical is y, as BVH says, or z where nobody stands along y.
     """
     roles = find_numbered_roles(moving.names, moving.rest)
     chains = [[roles.get(f"{side}_{name}") for name in ("shoulder", "hip", "knee", "ankle")] for side in "lr"]
@@ -142,11 +159,11 @@ def standing_rest(moving: MovingSkeleton) -> tuple[MovingSkeleton, int | None]:
     steps = np.diff(np.concatenate([moving.rest[None], moving.places])[:, np.array(chains)], axis=2)
     size = np.linalg.norm(steps, axis=3)
     cosine = np.stack([(-steps[..., axis] / np.maximum(size, 1e-12)).min(axis=(1, 2)) for axis in (1, 2)])
-    if cosine[:, 0].max() > 0.4:                     # it is nearly upright at rest
+    if cosine[:, 0].max() > 0.4:                     # every segment within 66 degrees of the vertical: it stands
         return moving, None
     along = cosine[int(cosine[0, 1:].max() < 0.8), 1:]
     best = int(along.argmax())
-    if along[best] < 0.8:                            # from where on somebody stands
+    if along[best] < 0.8:                            # no frame has all segments within 37 degrees of the vertical
         return moving, None
     rest = moving.places[best]
     offsets = rest - np.where(moving.parents[:, None] < 0, 0, rest[moving.parents])

@@ -1,8 +1,8 @@
-"""A motion of one skeleton on another whose rest pose, bones and parts differ: segments point where they pointed.
+"""Retargeting: a motion of one skeleton on another with a different rest pose, bones and parts.
 
-Every part of ours that has a counterpart takes its rotation, after that which brings our bone to theirs at rest: the
-directions of the limbs are then those of the motion exactly, and so is the twist about them. A trunk of any number of
-joints is brought to as many as we have.
+Every part of ours with a counterpart takes the counterpart's rotation, after the rotation that aligns the two bones at
+rest. So the directions of the limbs, and the twists about them, are exactly those of the motion. A trunk of any number
+of joints is mapped to ours.
 """
 from __future__ import annotations
 
@@ -26,18 +26,18 @@ Vertices = Callable[[np.ndarray, np.ndarray], np.ndarray]   # poses (T, J, 3), t
 
 @dataclass(frozen=True, eq=False)
 class Retargeted:
-    """A motion that was brought onto a body, by the conventions of the body models."""
+    """A retargeted motion, in the conventions of the body models."""
 
     poses: np.ndarray                # (T, J, 3) radians, against the body at rest
     trans: np.ndarray                # (T, 3) metres, travel of the root's joint
     rate: float                      # frames a second
     matched: dict[str, str]          # {part of the body: joint that it follows}
-    lacking: tuple[str, ...] = ()    # parts that go with the one above them: the motion has no such joint
-    scale: float = 1.0               # of the travel: how much longer our legs are
+    lacking: tuple[str, ...] = ()    # parts that the motion has no joint for; they follow their parent
+    scale: float = 1.0               # of the travel: ratio of the lengths of the legs
 
 
 class Pairing:
-    """A body and a skeleton that moves, both at rest.
+    """A body and a moving skeleton, both at rest, with their corresponding joints.
 
     Parameters
     ----------
@@ -46,8 +46,9 @@ class Pairing:
     vertices : Vertices
         The body's surface in some poses.
     moving : MovingSkeleton
+        The skeleton of the motion.
     pose : (J, 3) float, radians, optional
-        Of a statue: how the generic model's parts were rotated to the pose of the scan, which is its rest.
+        For a statue: rotations of the generic model's parts to the pose of the scan, which is its rest.
 
     Attributes
     ----------
@@ -80,10 +81,10 @@ class Pairing:
         self.up = _nearest_axis(high)
 
     def alignment(self, aligned: bool) -> dict[int, np.ndarray]:
-        """For each part the rotation from the axes of the generic model to those of the motion at rest.
+        """Compute for each part the rotation from the axes of the generic model to those of the motion at rest.
 
-        The smallest rotation that brings our bone to theirs, after that of the part above. Feet stand flat, but where
-        the legs are far apart at rest (as in the CMU files) they are taken to be square to the shanks from the front.
+        It is the smallest rotation that aligns our bone with theirs, after that of the parent. Feet stand flat. Where
+        the legs are far apart at rest, as in the CMU files, feet are perpendicular to the shanks seen from the front.
         """
         # from the axes of the generic model to those of the motion, both standing at rest
         whole = self.standing(aligned) @ self.standing(True).T
@@ -112,7 +113,7 @@ class Pairing:
         return A
 
     def middle(self) -> tuple[list[int], list[int]]:
-        """Our parts from the pelvis to the one that carries the arms, and from there to the head, all with ends."""
+        """List our parts from the pelvis to the one that carries the arms, and from there to the head, with ends."""
         parents, ours = self.skeleton.parents, self.ours
         arms = [way(parents, ours["humanoid_root"], ours[f"{side}_shoulder"]) for side in "lr"]
         carrier = [part for part in arms[0] if part in arms[1]][-1]
@@ -120,7 +121,8 @@ class Pairing:
         return way(parents, ours["humanoid_root"], carrier), way(parents, carrier, head)
 
     def trunk(self) -> tuple[dict[int, np.ndarray], dict[int, str]]:
-        """The rotation (T, 3, 3) of each of our parts between pelvis and head, without both, and what it follows."""
+        """Compute the rotation (T, 3, 3) of each of our parts between pelvis and head, and what it follows."""
+        # the joints of their trunk and neck, however the tree is arranged
         moving, R = self.moving, self.moving.rotations
         below, beyond = self.middle()
         parts, low, top = below[1:], *trunk(moving.parents, self.theirs)
@@ -144,26 +146,25 @@ class Pairing:
         return {part: np.broadcast_to(M, R[:, 0].shape) for part, M in out.items()}, told
 
     def world(self, aligned: bool) -> np.ndarray:
-        """The rotation (3, 3) from the axes of the motion to those of the scan: upwards to upwards, and forwards at
-        rest to where the scan faces.
-        """
+        """Compute the rotation (3, 3) from the axes of the motion to those of the scan: up to up, front to front."""
         return _upright(self.P[0] @ self.axes[:, 2], self.up) @ self.standing(aligned).T
 
     def standing(self, ours: bool) -> np.ndarray:
-        """(3, 3) to the left, upwards and forwards in the rest of the generic model or of the motion.
+        """Compute the axes (3, 3) left, up and front in the rest pose of the generic model or of the motion.
 
-        Upwards is the axis next to the trunk: joints of a person who stands upright need not lie above each other.
+        Up is the coordinate axis nearest to the trunk, since the joints of a standing person are not in one line.
         """
         _, high, forwards = (self.axes if ours else _axes(self.moving.rest, self.theirs)).T
         return _upright(forwards, _nearest_axis(high))
 
 
 def retarget_pair(pair: Pairing, aligned: bool = False, girdle: float = 0.2, here: bool = False) -> Retargeted:
-    """The motion of the pair's skeleton on its body; `aligned`: the body rests as that skeleton does.
+    """Retarget the motion of a pair's skeleton to its body; with `aligned`, the two have the same rest pose.
 
-    Where the motion has no clavicles, ours are raised by a share `girdle` of the upper arms' angle above the level.
-    Travel is scaled as the legs are, about the origin of the file; `here`: it begins where the body stands at rest.
+    Where the motion has no clavicles, ours are raised by a share `girdle` of the upper arms' elevation.
+    Travel is scaled as the legs are, about the origin of the file. With `here` it begins where the body stands at rest.
     """
+    # rotation of every part: of the trunk, of the joint with the same role or name, else that of the parent
     moving, skeleton = pair.moving, pair.skeleton
     A = pair.alignment(aligned)
     role_of = {part: role for role, part in pair.ours.items()}
@@ -184,7 +185,7 @@ def retarget_pair(pair: Pairing, aligned: bool = False, girdle: float = 0.2, her
         else:
             lacking.append(name)
             M[:, j] = M[:, skeleton.parents[j]] if j else np.eye(3)
-    # clavicles that the motion has not: raised by a share of what the upper arms are above the horizontal
+    # missing clavicles are raised by a share of the upper arms' angle above the horizontal
     left, high, _ = pair.axes.T
     for side, outwards in (("l", left), ("r", -left)):
         parts = [pair.ours.get(f"{side}_{name}") for name in ("sternoclavicular", "shoulder", "elbow")]
@@ -198,7 +199,7 @@ def retarget_pair(pair: Pairing, aligned: bool = False, girdle: float = 0.2, her
         M[:, clavicle] = M[:, clavicle] @ rotations.exp(angle[:, None] * np.cross(outwards, high))
     V = pair.world(aligned)
     poses = skeleton.pose_of(V @ M @ np.swapaxes(pair.P, -1, -2))
-    # travel: the middle between the hips is where that of the motion is, scaled
+    # travel: the middle between the hips follows that of the motion, scaled; soles stay at their height
     scale = _leg(skeleton.joints, pair.ours, pair.theirs) / _leg(moving.rest, pair.theirs, pair.ours)
     ours, theirs = ([roles["l_hip"], roles["r_hip"]] for roles in (pair.ours, pair.theirs))
     place = scale * moving.places[:, theirs].mean(axis=1) @ V.T
@@ -210,15 +211,15 @@ def retarget_pair(pair: Pairing, aligned: bool = False, girdle: float = 0.2, her
 
 
 def lift(vertices: Vertices, poses: np.ndarray, trans: np.ndarray, up: np.ndarray) -> float:
-    """How far a motion must rise for its lowest points to be where those of the body at rest are, metres."""
+    """Compute how far, metres, a motion must rise for its lowest points to be at the height of the soles at rest."""
     still = (vertices(np.zeros((1, *poses.shape[1:])), np.zeros((1, 3))) @ up).min()
     lowest = np.concatenate([(vertices(poses[k:k + 200], trans[k:k + 200]) @ up).min(axis=1)
-                             for k in range(0, len(poses), 200)])       # the meshes of 200 frames are held at a time
-    return float(still - np.percentile(lowest, 5))                      # percentile: some frames may err
+                             for k in range(0, len(poses), 200)])       # 200 meshes are held in memory at a time
+    return float(still - np.percentile(lowest, 5))                      # a percentile, as some frames may be wrong
 
 
 def _leg(joints: np.ndarray, roles: Mapping[str, int], others: Mapping[str, int]) -> float:
-    """Mean length of the legs, as far as both skeletons have them; without knees that of the trunk."""
+    """Compute the mean length of the legs, as far as both skeletons have them; without knees that of the trunk."""
     chains = [[roles[f"{side}_{name}"] for name in ("hip", "knee", "ankle") if f"{side}_{name}" in roles.keys()
                & others.keys()] for side in "lr"]
     if min(map(len, chains)) < 2:
@@ -227,7 +228,7 @@ def _leg(joints: np.ndarray, roles: Mapping[str, int], others: Mapping[str, int]
 
 
 def _axes(joints: np.ndarray, roles: Mapping[str, int]) -> np.ndarray:
-    """(3, 3) columns: to the left, upwards and forwards of a body at rest, from its hips and shoulders."""
+    """Compute the axes of a body at rest from its hips and shoulders: columns left, up and front (3, 3)."""
     hips, shoulders = ([joints[roles[f"{side}_{name}"]] for side in "lr"] for name in ("hip", "shoulder"))
     across = sum((a - b) / max(float(np.linalg.norm(a - b)), 1e-12) for a, b in (hips, shoulders))
     high = np.mean(shoulders, axis=0) - np.mean(hips, axis=0)
@@ -245,9 +246,9 @@ def _nearest_axis(direction: np.ndarray) -> np.ndarray:
 
 
 def _upright(forwards: np.ndarray, up: np.ndarray) -> np.ndarray:
-    """(3, 3) columns: to the left, upwards and, level, forwards."""
+    """Build axes from front and up: columns left, up and the level front (3, 3)."""
     level = forwards - (forwards @ up) * up
-    if np.linalg.norm(level) < 0.1:                                     # lies on the back or on the face
+    if np.linalg.norm(level) < 0.1:                                     # a body that lies on its back or face
         level = np.eye(3)[np.abs(up).argmin()]
         level = level - (level @ up) * up
     level = level / np.linalg.norm(level)

@@ -1,4 +1,4 @@
-"""A motion of the very parts of a body: copied, whatever axes its file has and whatever part its tree hangs on."""
+"""Copy a motion of a skeleton with the same parts, whatever the axes of its file and the root of its tree."""
 from __future__ import annotations
 
 import numpy as np
@@ -14,9 +14,9 @@ from .retarget import Retargeted, Vertices, lift
 
 
 def copy_motion(skeleton: Skeleton, rest: Mesh, vertices: Vertices, moving: MovingSkeleton) -> Retargeted | None:
-    """The motion of the same parts, which rest alike in axes of another name; None where it is another skeleton.
+    """Copy a motion of the same parts with the same rest pose in other axes; None for another skeleton.
 
-    The tree may hang on another part; bones may be those of another person.
+    The tree may have another root, and the bones may be those of another person.
     """
     names = skeleton.names
     if set(moving.names) != set(names):
@@ -29,7 +29,7 @@ def copy_motion(skeleton: Skeleton, rest: Mesh, vertices: Vertices, moving: Movi
     if not bones or len(bones) < (len(names) - 1) / 2:
         return None
     ours, theirs = skeleton.joints[bones] - skeleton.joints[skeleton.parents[bones]], moving.offsets[order][bones]
-    # the rotation that swaps axes and brings our bones nearest to theirs, the usual one where it is as near
+    # the rotation of axes, of the 24 that swap them, that brings our bones nearest to theirs; the usual one comes first
     turns = np.concatenate([turn_up(guess_upright(rest)[0])[None], Rotation.create_group("O").as_matrix().round()])
     sizes = np.linalg.norm(ours, axis=1) * np.linalg.norm(theirs, axis=1)
     kept = sizes > 1e-9
@@ -38,12 +38,12 @@ def copy_motion(skeleton: Skeleton, rest: Mesh, vertices: Vertices, moving: Movi
     cosine = np.einsum("na,kab,nb->kn", theirs[kept], turns, ours[kept]) / sizes[kept]
     off = np.degrees(np.arccos(np.clip(cosine, -1, 1))).mean(axis=1)
     best = int(np.flatnonzero(off < off.min() + 1e-3)[0])
-    if off[best] >= 10:                         # degrees: they do not rest alike
+    if off[best] >= 10:                         # degrees: the rest poses differ
         return None
     Q = turns[best]
     scale = np.linalg.norm(ours, axis=1).sum() / np.linalg.norm(theirs, axis=1).sum()
     poses = skeleton.pose_of(Q.T @ moving.rotations[:, order] @ Q)
     trans = scale * moving.places[:, order[shared[0]]] @ Q - joint_places(skeleton, poses)[:, shared[0]]
-    if np.abs(scale * theirs @ Q - ours).max() > 1e-3:          # metres: another person, soles where theirs would be
+    if np.abs(scale * theirs @ Q - ours).max() > 1e-3:          # metres: bones of another person; correct the soles
         trans = trans + lift(vertices, poses, trans, Q.T @ [0, 1, 0]) * (Q.T @ [0, 1, 0])
     return Retargeted(poses, trans, moving.rate, dict(zip(names, names, strict=True)), (), float(scale))

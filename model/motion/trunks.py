@@ -1,4 +1,4 @@
-"""A trunk of any number of joints on one of as many parts as we have."""
+"""Retargeting of trunks: any number of joints to any number of parts."""
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
@@ -12,10 +12,10 @@ from .moving import MovingSkeleton
 
 def group_trunk(moving: MovingSkeleton, joints: Sequence[int], starts: Sequence[int], parts: Sequence[int],
                 carried: Sequence[int]) -> tuple[dict[int, np.ndarray], dict[int, str]]:
-    """The rotation (T, 3, 3) of each of fewer parts than there are joints of a trunk, and what it follows.
+    """Compute rotations (T, 3, 3) for fewer parts than joints of a trunk, and what each follows.
 
-    Each part stands for the joints from one of `starts` to the next. It brings the next part where its joints bring it;
-    the last one the joints that are `carried`, neck and shoulders, as nearly as one rotation can.
+    Each part stands for the joints from one of `starts` to the next, and carries the next part as these joints do. The
+    last part carries the `carried` joints, neck and shoulders, as nearly as one rotation can.
     """
     rest, R, y = moving.rest, moving.rotations, moving.places
     out, told = {}, {}
@@ -35,8 +35,9 @@ def group_trunk(moving: MovingSkeleton, joints: Sequence[int], starts: Sequence[
 
 
 def nearest_starts(ours: np.ndarray, theirs: np.ndarray) -> list[int]:
-    """Which of their joints begins each of our parts, by heights (n,) and (m,), m at least n: one after the other the
-    nearest that leaves enough for the rest.
+    """Choose which of their joints begins each of our parts, by heights (n,) and (m,), m at least n.
+
+    Each part takes the nearest joint that leaves enough joints for the rest.
     """
     out, spare = [0], len(theirs) - len(ours)
     for i, height in enumerate(ours[1:], start=1):
@@ -46,7 +47,7 @@ def nearest_starts(ours: np.ndarray, theirs: np.ndarray) -> list[int]:
 
 
 def heights(joints: np.ndarray, some: Sequence[int], roles: Mapping[str, int]) -> np.ndarray:
-    """(n,) how far along the trunk some of the joints (J, 3) are, 0 at the hips and 1 at the shoulders."""
+    """Compute how far along the trunk some of the joints (J, 3) are, (n,): 0 at the hips and 1 at the shoulders."""
     hips, shoulders = (joints[[roles[f"l_{name}"], roles[f"r_{name}"]]].mean(axis=0) for name in ("hip", "shoulder"))
     along = shoulders - hips
     return np.asarray((joints[some] - hips) @ along / (along @ along))
@@ -54,7 +55,7 @@ def heights(joints: np.ndarray, some: Sequence[int], roles: Mapping[str, int]) -
 
 def spread_rotations(moving: MovingSkeleton, steps: Sequence[int], parts: Sequence[int]
                      ) -> tuple[dict[int, np.ndarray], dict[int, str]]:
-    """Rotations (T, 3, 3) for parts that follow some joints, spread evenly over them; the last follows the last."""
+    """Interpolate rotations (T, 3, 3) for parts spread evenly over joints; the last part follows the last joint."""
     out, told = {}, {}
     for i, part in enumerate(parts, start=1):
         at = i * (len(steps) - 1) / len(parts)
@@ -68,7 +69,7 @@ def spread_rotations(moving: MovingSkeleton, steps: Sequence[int], parts: Sequen
 
 
 def swing(R: np.ndarray, before: np.ndarray, now: np.ndarray) -> np.ndarray:
-    """Rotations (T, 3, 3) after the smallest ones that bring `R @ before` (3,) to the directions `now` (T, 3)."""
+    """Rotate R (T, 3, 3) by the smallest rotations that bring `R @ before` (3,) to the directions `now` (T, 3)."""
     was = R @ before
     if np.linalg.norm(before) < 1e-6:
         return R

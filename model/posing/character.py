@@ -26,8 +26,8 @@ class CharacterConfig(Settings):
     Attributes
     ----------
     pose : "found" or "rest"
-        How the character stands: its parts are turned against the template's, which is found and undone, or it stands
-        in the template's pose and parts that look turned are built so.
+        "found" estimates the character's pose from the mesh and undoes it. "rest" assumes the template's pose, so parts
+        that look rotated have that shape.
     """
 
     pose: Annotated[Literal["found", "rest"], FLAG] = "found"
@@ -35,19 +35,21 @@ class CharacterConfig(Settings):
 
 def character_model(model: BodyModel, vertices: np.ndarray, config: CharacterConfig | None = None,
                     pose: np.ndarray | None = None) -> BodyModel:
-    """The model with a character in place of its mean person.
+    """Build a model with a character in place of its mean person.
 
-    Shape components, pose-dependent deformation and pose prior stay: betas are offsets from the character, whose own
-    are zero. None is still the template's own body.
+    Shape components, pose-dependent deformation and pose prior stay. Betas are then offsets from the character, whose
+    betas are zero. `betas=None` is still the template's own body.
 
     Parameters
     ----------
     model : BodyModel
+        A model with betas.
     vertices : (N, 3) float, metres
         The character in the triangles of the model's template, anywhere.
     config : CharacterConfig, optional
+        Settings.
     pose : (J, 3) float, radians, optional
-        How the character stands, where it is known.
+        The pose of the character, where it is known.
 
     Raises
     ------
@@ -72,7 +74,7 @@ def character_model(model: BodyModel, vertices: np.ndarray, config: CharacterCon
 
 
 def character_pose(model: BodyModel, vertices: np.ndarray, config: CharacterConfig) -> np.ndarray:
-    """How the parts (J, 3) of a character are turned against the template's, radians."""
+    """Estimate the pose (J, 3) of a character relative to the template, radians."""
     R = model.skeleton.fit_rotations(model.template, vertices)
     if config.pose == "rest":
         R[:] = R[0]
@@ -97,9 +99,11 @@ class CharacterMeshConfig(Settings):
 
 @dataclass(frozen=True, eq=False)
 class Character:
-    """A character as the mean of a body model, the template on it as it stands, its pose (J, 3), its joints (J, 3),
-    metres, which of them lie inside, and how the template was registered to it, None for a mesh that had the template's
-    triangles.
+    """Result of `register_character`.
+
+    `model` has the character as its mean. `mesh` is the template registered to the character, with its `pose` (J, 3),
+    `joints` (J, 3), metres, and which of these lie `inside` (J,). `registration` is None for a mesh that had the
+    template's triangles.
     """
 
     model: BodyModel
@@ -139,11 +143,11 @@ def register_character(model: BodyModel, mesh: Mesh, landmarks: Mapping[str, np.
 def _register_character(template: Mesh, mesh: Mesh, vertices: np.ndarray, points: np.ndarray,
                         config: CharacterMeshConfig,
                         progress: Progress | None) -> Registration:
-    """The template on the mesh; first at the template's size, then from where that left it."""
+    """Register the template to the mesh, scaled by the landmarks, in two passes."""
     tell = progress or (lambda done, total: None)
     size = _spread(template.vertices[vertices]) / _spread(points)
     start = template.with_vertices(template.vertices / size)
-    # registrations of the template, each from where the last one left it: one alone does not stretch so far
+    # two registrations, the second from the result of the first: one alone does not stretch so far
     registrations = 2
     for k in range(registrations):
         def told(done: int, total: int, before: int = k) -> None:
@@ -155,12 +159,12 @@ def _register_character(template: Mesh, mesh: Mesh, vertices: np.ndarray, points
 
 
 def _spread(points: np.ndarray) -> float:
-    """The root mean square distance of points (n, 3) from their middle."""
+    """Compute the root mean square distance of points (n, 3) from their centroid."""
     return float(np.sqrt(((points - points.mean(axis=0))**2).sum(axis=1).mean()))
 
 
 def points_inside(mesh: Mesh, points: np.ndarray) -> np.ndarray:
-    """Which points (n, 3) lie inside a closed mesh; ValueError for one that is not finite."""
+    """Find which points (n, 3) lie inside a closed mesh; ValueError for points that are not finite."""
     import igl
 
     turns = igl.fast_winding_number(*check_surface(mesh), check_points(points))
@@ -168,9 +172,9 @@ def points_inside(mesh: Mesh, points: np.ndarray) -> np.ndarray:
 
 
 def character_problem(found: Character) -> str | None:
-    """Why a character means nothing, with the likely cause; None where it means something."""
+    """Explain why a character is useless, with the likely cause; None where it is usable."""
     missed = 0.0 if found.registration is None else found.registration.uncovered
-    lost = 0.5  # share of the character missed, or of joints outside it, that means nothing
+    lost = 0.5  # with half of the character missed, or half of the joints outside, the registration has failed
     if missed <= lost and found.inside.mean() >= lost:
         return None
     return (f"{100 * missed:.0f}% of the character lies off the template and {found.inside.sum()} of "

@@ -86,10 +86,10 @@ def character(mesh: MeshArg, model: Annotated[Path, Alias("-m")], output: Output
     if landmarks is None and not same:
         raise ValueError(f"{mesh}: expected --landmarks for a mesh of other triangles than the model's "
                          f"({loaded.template}), found {body}")
-    theirs = None if landmarks is None else read_landmarks(landmarks, body, unit)
+    marks = None if landmarks is None else read_landmarks(landmarks, body, unit)
     ours = None if template_landmarks is None else read_landmark_vertices(template_landmarks, loaded.template)
     with bar("registering") as progress:
-        found = register_character(loaded, body, theirs, ours, config, progress)
+        found = register_character(loaded, body, marks, ours, config, progress)
     found.model.save(output)
     save_png(output.with_suffix(".png"), picture_character(found.model))
     rows = [] if found.registration is None else [
@@ -136,6 +136,7 @@ def mesh(model: ModelArg, output: Output, pose: Path | None = None, betas: tuple
         raise UsageError("--betas, --subject and --own-body: expected one of them")
     if not (subject is not None or own_body or loaded.n_betas):
         raise ValueError(f"{model}: it has no shape components; ask for --own-body")
+    # the body: named, the template's own, of given betas, or the mean person
     person = read_subject(loaded, subject) if subject is not None or own_body else loaded.subject(
         np.array(betas if betas else (0.0,)))
     vertices = person.vertices(turns)
@@ -147,7 +148,7 @@ def mesh(model: ModelArg, output: Output, pose: Path | None = None, betas: tuple
 
 
 def _read_turns(path: Path) -> dict[str, np.ndarray]:
-    """Turns (3,), radians, by the names of parts."""
+    """Read rotation vectors (3,), radians, by the names of parts."""
     wanted = "turns {part: [x, y, z]}"
     tree = read_json(path, wanted)
     with taking_apart(path, f"{wanted} in JSON"):
@@ -156,9 +157,9 @@ def _read_turns(path: Path) -> dict[str, np.ndarray]:
 
 
 def read_subject(model: BodyModel, given: Path | None, unit: Unit | None = None) -> Subject:
-    """The subject named on the command line: betas in JSON or a motion file, or a mesh in the model's topology.
+    """Read the subject named on the command line: betas in JSON or a motion file, or a mesh in the model's topology.
 
-    Without a name it is the template's own body; of a mesh it has all the detail, which betas have not.
+    Without a name it is the template's own body. A mesh gives a subject with all its detail, beyond betas.
     """
     if given is None:
         return model.subject(None)
@@ -169,15 +170,15 @@ def read_subject(model: BodyModel, given: Path | None, unit: Unit | None = None)
 
 
 def _read_betas(path: Path) -> np.ndarray:
-    """Betas (k,) from JSON or from the array of that name in an `.npz`; none for the template's own body."""
+    """Read betas (k,) from JSON or from the array of that name in an `.npz`; none for the template's own body."""
     wanted = 'betas [b1, b2, ...] or {"betas": [...]}'
     if path.suffix == ".json":
-        found = read_json(path, wanted)
-        found = found.get("betas") if isinstance(found, dict) else found
+        values = read_json(path, wanted)
+        values = values.get("betas") if isinstance(values, dict) else values
     else:
-        found = load_arrays(path, only=("betas",)).get("betas")
+        values = load_arrays(path, only=("betas",)).get("betas")
     try:
-        betas = np.array(found, dtype=np.float64)
+        betas = np.array(values, dtype=np.float64)
     except (TypeError, ValueError, OverflowError):
         betas = np.array(np.nan)
     if betas.ndim != 1 or not np.isfinite(betas).all():

@@ -1,4 +1,4 @@
-"""Poses by hand: from joint angles, by rotating a joint, and mirrored, left for right."""
+"""Poses by hand: from joint angles, by rotating a joint, and mirrored."""
 from __future__ import annotations
 
 from collections.abc import Mapping
@@ -18,23 +18,33 @@ Frame = Literal["parent", "world", "own"]
 
 
 def pose_from_angles(skeleton: Skeleton, angles: Mapping[str | int, Any]) -> np.ndarray:
-    """A pose in which some parts are turned against their parents and all others are at rest.
+    """Build a pose in which some parts are rotated relative to their parents and all others are at rest.
 
     Parameters
     ----------
     skeleton : Skeleton
-    angles : {part: turn}
-        Parts by name or number. A turn is an axis-angle vector (3,) in radians, or an axis and degrees: `("x", 30)`,
-        `((0, 1, 1), -45)`. Axes are those of the template.
+        The model's skeleton.
+    angles : dict of str or int to rotation
+        Parts by name or number. A rotation is an axis-angle vector (3,) in radians, or an axis and degrees:
+        `("x", 30)`, `((0, 1, 1), -45)`. Axes are those of the template.
 
     Returns
     -------
     (J, 3) float, radians
+        The pose.
 
     Raises
     ------
     ValueError
-        A part that is not known or given twice, a turn that is neither.
+        A part that is unknown or given twice, or a rotation of another form.
+
+    Examples
+    --------
+    >>> from model import load_built_in_model
+    >>> skeleton = load_built_in_model().skeleton
+    >>> pose = pose_from_angles(skeleton, {"forearm_left": ("x", 90)})
+    >>> bool(np.isclose(np.linalg.norm(pose), np.pi / 2))
+    True
     """
     pose = np.zeros((len(skeleton.parents), 3))
     seen: set[int] = set()
@@ -49,13 +59,16 @@ def pose_from_angles(skeleton: Skeleton, angles: Mapping[str | int, Any]) -> np.
 
 def rotate_joint(skeleton: Skeleton, pose: np.ndarray, part: str | int, rotation: Any, frame: Frame = "parent"
                  ) -> np.ndarray:
-    """Rotate one part, and what hangs below it, further from where it is.
+    """Rotate one part, and what hangs below it, further from its present rotation.
 
     Parameters
     ----------
     skeleton : Skeleton
+        The model's skeleton.
     pose : (..., J, 3) float, radians
+        The present pose.
     part : str or int
+        Name or number of the part.
     rotation
         As in `pose_from_angles`: axis-angle vector, or axis and degrees.
     frame : str
@@ -90,7 +103,7 @@ def rotate_joint(skeleton: Skeleton, pose: np.ndarray, part: str | int, rotation
 
 
 def part_number(skeleton: Skeleton, part: str | int) -> int:
-    """The number of a part given by name or number, or ValueError."""
+    """Find the number of a part given by name or number; else ValueError."""
     if isinstance(part, str):
         if part not in skeleton.names:
             raise ValueError(f"part: no '{part}'; the skeleton has {', '.join(skeleton.names)}")
@@ -101,7 +114,7 @@ def part_number(skeleton: Skeleton, part: str | int) -> int:
 
 
 def rotation_vector(given: Any, name: str) -> np.ndarray:
-    """The axis-angle vector (3,), radians, of a vector or of an axis with degrees."""
+    """Convert a vector, or an axis with degrees, to an axis-angle vector (3,), radians."""
     axes = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
     if isinstance(given, tuple | list) and len(given) == 2:
         axis, degrees = given
@@ -127,30 +140,48 @@ def _finite(given: Any, name: str) -> np.ndarray:
 
 @dataclass(frozen=True, eq=False)
 class Mirror(MirrorPlane):
-    """The plane of a body's symmetry and which parts it exchanges."""
+    """The symmetry plane of a body and the parts that it exchanges."""
 
     partners: np.ndarray             # (J,) the part on the other side; a part in the middle is its own
     distance: float                  # metres, RMS of mirrored joints and centroids from those of the partners
 
     def trans(self, skeleton: Skeleton, trans: np.ndarray) -> np.ndarray:
-        """The places (..., 3) of mirrored bodies, metres."""
+        """Compute the places (..., 3) of mirrored bodies, metres."""
         return self.reflect(skeleton.joints[0] + trans) - skeleton.joints[0]
 
 
 def mirror_pose(mirror: Mirror, pose: np.ndarray) -> np.ndarray:
-    """Mirrored poses: every part does what its partner did, seen in the mirror.
+    """Mirror poses: every part moves as its partner on the other side did.
 
-    The rotation becomes `M R M`, its axis-angle vector `-M pose`; twice is the identity.
+    A rotation R becomes `M R M`, and its axis-angle vector `-M pose`. Mirroring twice is the identity.
 
     Parameters
     ----------
     mirror : Mirror
-        Of `find_mirror`.
+        Symmetry of the body, see `find_mirror`.
     pose : (..., J, 3) float, radians
+        Poses.
 
     Returns
     -------
     (..., J, 3) float, radians
+        The mirrored poses.
+
+    Raises
+    ------
+    ValueError
+        A pose of another shape.
+
+    Examples
+    --------
+    >>> from model import load_built_in_model
+    >>> from model.posing.poses import find_mirror
+    >>> model = load_built_in_model()
+    >>> mirror = find_mirror(model.template, model.skeleton)
+    >>> pose = pose_from_angles(model.skeleton, {"forearm_left": ("x", 60)})
+    >>> part = int(np.abs(mirror_pose(mirror, pose)).sum(axis=1).argmax())
+    >>> model.skeleton.names[part]
+    'forearm_right'
     """
     pose = np.asarray(pose, dtype=np.float64)
     if pose.shape[-2:] != (len(mirror.partners), 3):
@@ -159,11 +190,11 @@ def mirror_pose(mirror: Mirror, pose: np.ndarray) -> np.ndarray:
 
 
 def find_mirror(template: Mesh, skeleton: Skeleton) -> Mirror:
-    """The plane in which a template and its skeleton are most nearly their own mirror image.
+    """Find the plane in which a template and its skeleton are most nearly symmetric.
 
-    Planes halfway between two parts are tried, and those through the body's main axes; under each, parts are paired
-    where they come nearest, and the plane is fitted to the pairs. Only a body without any pair is mirrored with every
-    part staying its own partner.
+    Planes halfway between two parts are tried, and those through the body's principal axes. For each plane, parts are
+    paired with the nearest mirrored ones, and the plane is fitted to the pairs. Every part is its own partner only in a
+    body without any pair.
 
     Raises
     ------
@@ -173,13 +204,13 @@ def find_mirror(template: Mesh, skeleton: Skeleton) -> Mirror:
     marks = _marks(template, skeleton)
     size = float(np.linalg.norm(np.ptp(template.vertices, axis=0)))
     tried = (_fit_mirror(skeleton, marks, plane) for plane in _candidates(template, marks))
-    found = [mirror for mirror in tried if mirror is not None]
-    if not found:
+    mirrors = [mirror for mirror in tried if mirror is not None]
+    if not mirrors:
         raise ValueError("skeleton: it is not symmetric, no mirror image of its tree is the tree itself")
     each = np.arange(len(skeleton.parents))
-    exchanging = [m for m in found if (m.partners != each).any()]
-    best = min(exchanging or found, key=lambda m: m.distance)
-    # where no parts are exchanged they may lie less far apart: a man is nearly flat, but not his own front to back
+    exchanging = [m for m in mirrors if (m.partners != each).any()]
+    best = min(exchanging or mirrors, key=lambda m: m.distance)
+    # without exchanged parts the limit is stricter: a man is nearly flat, but front and back are not symmetric
     if best.distance > (0.08 if exchanging else 0.015) * size:
         image = np.linalg.norm(best.reflect(marks) - marks[:, best.partners], axis=-1).max(axis=0)
         worst = int(image.argmax())
@@ -190,7 +221,7 @@ def find_mirror(template: Mesh, skeleton: Skeleton) -> Mirror:
 
 
 def _marks(template: Mesh, skeleton: Skeleton) -> np.ndarray:
-    """(2, J, 3) what is mirrored: joints and centroids of the parts, metres."""
+    """Collect the points that are mirrored, (2, J, 3): joints and centroids of the parts, metres."""
     J, part = len(skeleton.parents), skeleton.part_of_face
     area = np.bincount(part, template.face_areas, J)
     middle = template.corners.mean(axis=1) * template.face_areas[:, None]
@@ -199,7 +230,7 @@ def _marks(template: Mesh, skeleton: Skeleton) -> np.ndarray:
 
 
 def _candidates(template: Mesh, marks: np.ndarray) -> list[MirrorPlane]:
-    """Planes to start from: halfway between two parts, and through the body's main axes."""
+    """List planes to start from: halfway between two parts, and through the body's principal axes."""
     middle = marks[1]
     planes = [MirrorPlane(apart / np.linalg.norm(apart), (one + other) / 2)
               for one, other in combinations(middle, 2) if np.linalg.norm(apart := one - other) > 0]
@@ -208,7 +239,7 @@ def _candidates(template: Mesh, marks: np.ndarray) -> list[MirrorPlane]:
 
 
 def _fit_mirror(skeleton: Skeleton, marks: np.ndarray, plane: MirrorPlane) -> Mirror | None:
-    """The mirror near a plane, parts paired and plane fitted in turn; None where parts cannot be paired."""
+    """Fit a mirror near a plane by pairing parts and fitting the plane in turn; None where parts cannot be paired."""
     partners = np.full(len(skeleton.parents), -1)
     for _ in range(10):
         before = partners
@@ -224,7 +255,7 @@ def _fit_mirror(skeleton: Skeleton, marks: np.ndarray, plane: MirrorPlane) -> Mi
 
 
 def _pair_parts(skeleton: Skeleton, image: np.ndarray, marks: np.ndarray) -> np.ndarray | None:
-    """The partner of every part, paired where they come nearest; None where that breaks the tree."""
+    """Pair every part with the nearest mirrored one; None where that does not respect the tree."""
     cost = ((image[:, :, None] - marks[:, None]) ** 2).sum(axis=(0, -1))
     partners, parents = linear_sum_assignment(cost)[1], skeleton.parents
     whole = (partners[partners] == np.arange(len(partners))).all() and partners[0] == 0

@@ -9,13 +9,15 @@ from ..body import BodyModel
 from ..fitting.vertices import FitConfig, PoseFit, ShapeFit, fit_pose, fit_shape
 from ..linear import Subject, check_pose
 
-QUICK = FitConfig(polish=0)          # of pose and betas: the body's own shape takes up what a rough fit leaves
+QUICK = FitConfig(polish=0)          # a rough fit of pose and betas is enough: the body's own shape absorbs the rest
 
 
 @dataclass(frozen=True, eq=False)
 class OwnBody:
-    """A registered body as a subject of its own, the pose (J, 3) and place (3,) in which it was registered, the subject
-    there (N, 3), and how far its vertices are from the registered ones, metres.
+    """A registered body as a subject of its own, with its registered pose (J, 3) and place (3,).
+
+    `vertices` (N, 3) are those of the subject in that pose; `mean` and `largest`, metres, their distance from the
+    registered ones.
     """
 
     subject: Subject
@@ -27,21 +29,35 @@ class OwnBody:
 
 
 def subject_from_body(model: BodyModel, vertices: np.ndarray) -> Subject:
-    """The subject whose shape is that of one registered body, detail that betas do not reach included.
+    """Build the subject whose shape is that of one registered body, including detail beyond the betas.
 
-    In the body's own pose it is that body, to the millimetre or two that smoothing takes; in others the pose-dependent
-    deformation of the model is added. Its `betas` are the fitted ones and describe it only roughly.
+    In the body's own pose it is that body, to the millimetre or two that smoothing takes. In other poses the model's
+    deformation by pose is added. Its `betas` are the fitted ones and describe it only roughly.
 
     Parameters
     ----------
     model : BodyModel
+        A model of any kind.
     vertices : (N, 3) float, metres
-        In the topology of the model's template.
+        The body, in the topology of the model's template.
+
+    Returns
+    -------
+    Subject
+        The body, ready to be posed.
 
     Raises
     ------
     ValueError
-        Vertices of another count or not finite.
+        Another number of vertices, or vertices that are not finite.
+
+    Examples
+    --------
+    >>> from model import load_built_in_model
+    >>> model = load_built_in_model()
+    >>> person = model.vertices(np.zeros((16, 3)), np.array([1.0, -1.0]))
+    >>> subject_from_body(model, person).vertices(np.zeros((3, 16, 3))).shape
+    (3, 5002, 3)
 
     [SCAPE] Eq. 8, 9
     """
@@ -49,7 +65,7 @@ def subject_from_body(model: BodyModel, vertices: np.ndarray) -> Subject:
 
 
 def own_body(model: BodyModel, vertices: np.ndarray, fit: PoseFit | None = None) -> OwnBody:
-    """As `subject_from_body`, with the pose and the place of the body, which are found unless a fit is given."""
+    """Build the subject of `subject_from_body` together with the body's pose and place, fitted unless given."""
     if fit is None:
         fit = fit_shape(model, vertices, QUICK) if model.n_betas else fit_pose(model.subject(None), vertices, QUICK)
     pose, _ = check_pose(model.skeleton, fit.pose, None)
@@ -59,7 +75,8 @@ def own_body(model: BodyModel, vertices: np.ndarray, fit: PoseFit | None = None)
                          f"got shape {vertices.shape}")
     betas = fit.betas if isinstance(fit, ShapeFit) else None
     subject = replace(model.exact_subject(vertices, pose, betas), betas=betas)
+    # place the subject's root joint where the body has it
     trans = (model.joint_regressor[[0]] @ (vertices - subject.vertices(pose)))[0]
-    found = subject.vertices(pose, trans)
-    far = np.linalg.norm(found - vertices, axis=1)
-    return OwnBody(subject, pose, trans, found, float(far.mean()), float(far.max()))
+    placed = subject.vertices(pose, trans)
+    far = np.linalg.norm(placed - vertices, axis=1)
+    return OwnBody(subject, pose, trans, placed, float(far.mean()), float(far.max()))

@@ -1,4 +1,4 @@
-"""The same model on another triangulation of its template's surface."""
+"""Change the resolution of a model: the same model on another triangulation of its template's surface."""
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
@@ -22,7 +22,7 @@ class ResolutionConfig(Settings):
     Parameters
     ----------
     rounds : int
-        How often pose space and shape space are corrected; none for a fast and rougher answer.
+        How often pose space and shape space are corrected; 0 is faster and rougher.
     """
 
     rounds: int = 2
@@ -32,28 +32,39 @@ def change_resolution(model: BodyModel, template: Mesh, config: ResolutionConfig
                       progress: Progress | None = None) -> BodyModel:
     """Transfer a model to a coarser or finer triangulation, so that pose, betas and trans keep their meaning.
 
-    A skinning model turns parts about joints, and on a body of other betas these are averages of the vertices within
-    two edges of the borders of parts, with other triangles a band of another width: such bodies move some millimetres
-    apart when they bend. SCAPE models do not use joints in this way.
+    Bent bodies of a skinning model may move some millimetres. Its joints are averages of the vertices within two edges
+    of the borders of parts, and other triangles make that band wider or narrower. SCAPE models are not affected.
 
     Parameters
     ----------
     model : BodyModel
-    template : Mesh
+        A model of any kind.
+    template : Mesh, metres
         Other triangles on the surface of the model's template, in the same place.
     config : ResolutionConfig, optional
-    progress : callable(done, total), optional
+        Settings.
+    progress : callable, optional
+        Called as progress(done, total).
 
     Returns
     -------
     BodyModel
-        Of the same kind, with the same tree, joints, features, betas and priors; landmarks are on the nearest new
-        vertices.
+        A model of the same kind, with the same tree, joints, features, betas and priors. Landmarks are on the nearest
+        new vertices.
 
     Raises
     ------
     ValueError
-        Not usable as a template, another surface, or too coarse to have every part.
+        A mesh that is no template, another surface, or too coarse to have every part.
+
+    Examples
+    --------
+    >>> from model import load_built_in_model
+    >>> from model.resolution.change import ResolutionConfig, resample
+    >>> model = load_built_in_model()
+    >>> coarse = change_resolution(model, resample(model.template, 2000), ResolutionConfig(rounds=0))
+    >>> len(coarse.template.vertices), coarse.n_betas
+    (2000, 30)
 
     [MoSh]
     """
@@ -73,27 +84,27 @@ def change_resolution(model: BodyModel, template: Mesh, config: ResolutionConfig
 
 def resolution_gap(model: BodyModel, changed: BodyModel, poses: np.ndarray, betas: np.ndarray | None = None
                    ) -> np.ndarray:
-    """(B,) mean distance, metres, of two resolutions of a model at the vertices of the second, in poses (B, J, 3).
+    """Measure the mean distance (B,), metres, of two resolutions of a model in poses (B, J, 3).
 
-    With betas (B, k), or of the template's own body.
+    At the vertices of the second, for betas (B, k) or the template's own body.
     """
     follow, gaps = SurfaceCarrier(model.template, changed.template), []
     for b, pose in enumerate(poses):
-        mine = None if betas is None else betas[b]
-        off = follow.positions(model.vertices(pose, mine)) - changed.vertices(pose, mine)
+        own = None if betas is None else betas[b]
+        off = follow.positions(model.vertices(pose, own)) - changed.vertices(pose, own)
         gaps.append(np.linalg.norm(off, axis=1).mean())
     return np.array(gaps)
 
 
 def subdivide_at_middles(mesh: Mesh, times: int = 1) -> Mesh:
-    """Every triangle cut into four by the middles of its sides, so that the surface stays."""
+    """Cut every triangle into four at the middles of its sides; the surface stays the same."""
     import igl
 
     return Mesh(*igl.upsample(mesh.vertices, mesh.faces, times))
 
 
 def resample(mesh: Mesh, vertices: int) -> Mesh:
-    """About so many vertices on the same surface: subdivided until there are enough, then decimated."""
+    """Resample a surface to about so many vertices: subdivide until there are enough, then decimate."""
     times = 0
     while len(mesh.vertices) < vertices:
         mesh, times = subdivide_at_middles(mesh), times + 1
@@ -102,7 +113,7 @@ def resample(mesh: Mesh, vertices: int) -> Mesh:
 
 
 def _check_same_surface(old: Mesh, new: Mesh) -> None:
-    # mean edges of the coarser surface that the two may lie apart
+    # the two surfaces may be two mean edges of the coarser one apart
     limit = 2.0 * max(old.mean_edge, new.mean_edge)
     for a, b, which in ((new, old, "it lies"), (old, new, "the model's own lies")):
         far = float(Surface(b).closest(a.vertices).distances.max())

@@ -1,4 +1,4 @@
-"""Parts, vertices and what is known on them transferred to another triangulation of their surface."""
+"""Transfer of parts, vertices and fields to another triangulation of the same surface."""
 from __future__ import annotations
 
 from functools import cached_property
@@ -17,24 +17,25 @@ from ..stitching import edge_operator
 
 
 def transfer_skeleton(skeleton: Skeleton, old: Mesh, new: Mesh) -> Skeleton:
-    """The same tree and joints, the parts painted onto the new triangles by majority.
+    """Transfer a skeleton: the same tree and joints, with parts assigned to the new triangles by majority.
 
-    ValueError where it is too coarse: a part gets no triangles, or no longer touches its parent.
+    ValueError where the mesh is too coarse: a part gets no triangles, or no longer touches its parent.
     """
     J, F = len(skeleton.parents), len(new.faces)
+    # points inside every new triangle vote for the part of the nearest old triangle
     bary = _inner_points(_cuts(old, new))
     points = np.einsum("sc,fcd->fsd", bary, new.corners)
     hit = Surface(old).closest(points.reshape(-1, 3)).faces
     votes = np.zeros((F, J))
     np.add.at(votes, (np.repeat(np.arange(F), len(bary)), skeleton.part_of_face[hit]), 1 / len(bary))
     part = keep_connected(-votes, new.face_pairs, new.face_areas, votes.argmax(axis=1))
-    found = np.bincount(part, minlength=J)
+    sizes = np.bincount(part, minlength=J)
     least = 6  # triangles that a part needs: fewer are no piece of surface
-    if found.min() < least:
-        lost = int(found.argmin())
+    if sizes.min() < least:
+        lost = int(sizes.argmin())
         share = old.face_areas[skeleton.part_of_face == lost].sum() / old.face_areas.sum()
-        needed = 2 * least * max(1 / share, F / max(found[lost], 1))       # by its area, and by what it got
-        raise ValueError(f"template: {F} triangles are too coarse, {found[lost]} are left for part "
+        needed = 2 * least * max(1 / share, F / max(sizes[lost], 1))       # by its area, and by what it got
+        raise ValueError(f"template: {F} triangles are too coarse, {sizes[lost]} are left for part "
                          f"'{skeleton.names[lost]}'; expected some {needed:.0f} or more")
     carried = Skeleton(part, skeleton.parents, skeleton.joints, skeleton.names)
     for j in range(1, J):
@@ -45,7 +46,7 @@ def transfer_skeleton(skeleton: Skeleton, old: Mesh, new: Mesh) -> Skeleton:
 
 
 class Piece:
-    """One part on both triangulations: what is known on its old triangles (f,) is transferred to its new ones (g,)."""
+    """One part on both triangulations: transfers fields from its old triangles (f,) to its new ones (g,)."""
 
     def __init__(self, old: Mesh, new: Mesh, old_faces: np.ndarray, new_faces: np.ndarray) -> None:
         self.old_faces, self.new_faces = old_faces, new_faces
@@ -73,16 +74,15 @@ class Piece:
         return G, Factored(csc_array(G.T @ G + anchor))
 
     def average(self, values: np.ndarray) -> np.ndarray:
-        """Area-weighted averages (g, ...) of values (f, ...) of the old triangles."""
+        """Average values (f, ...) of the old triangles over each new one, by area: (g, ...)."""
         return (self._mean @ values.reshape(len(values), -1)).reshape(-1, *values.shape[1:])
 
     def edges(self, action: np.ndarray) -> np.ndarray:
-        """The edges (n, g, 2, 3), metres, of the new triangles when the old ones alone are deformed by `action` (n, f,
-        3, 3).
+        """Compute edges (n, g, 2, 3), metres, of the new triangles when `action` (n, f, 3, 3) deforms the old ones.
 
-        Stitching takes from the edges of a part only what is the gradient of some displacement of that part: all the
-        rest vanishes in the normal equations. So the part is stitched on its own, without loss, and the new vertices
-        are carried along with the triangles on which, or nearest to which, they lie.
+        Stitching uses only the integrable part of a part's edges; the rest vanishes in the normal equations. So the
+        part is stitched on its own, without loss. The new vertices follow the triangles on which, or nearest to which,
+        they lie.
         """
         G, normal = self._stitch
         wanted = edges(self.before.vertices, self.before.faces) @ np.swapaxes(action, -1, -2)     # (n, f, 2, 3)
@@ -95,9 +95,9 @@ class Piece:
 
 
 def gradients_of(before: np.ndarray, after: np.ndarray, otherwise: np.ndarray | None = None) -> np.ndarray:
-    """The matrices (..., g, 3, 3) that carry edges (g, 2, 3) to other edges (..., g, 2, 3).
+    """Compute the matrices (..., g, 3, 3) that map edges (g, 2, 3) to other edges (..., g, 2, 3).
 
-    Across the triangles, of which edges say nothing, they act as `otherwise`, or not at all.
+    Along the normal, which edges do not determine, they act as `otherwise`, or map to zero.
     """
     dual = np.linalg.solve(before @ np.swapaxes(before, -1, -2), before)      # (g, 2, 3)
     carried = np.swapaxes(after, -1, -2) @ dual
@@ -105,7 +105,7 @@ def gradients_of(before: np.ndarray, after: np.ndarray, otherwise: np.ndarray | 
 
 
 def _inner_points(n: int) -> np.ndarray:
-    """(n², 3) barycentric coordinates of the middles of n² equal pieces of a triangle."""
+    """Compute barycentric coordinates (n², 3) of the centres of n² equal pieces of a triangle."""
     up = [(i + 1 / 3, j + 1 / 3) for i in range(n) for j in range(n - i)]
     down = [(i + 2 / 3, j + 2 / 3) for i in range(n - 1) for j in range(n - 1 - i)]
     two = np.array(up + down) / n
@@ -113,12 +113,12 @@ def _inner_points(n: int) -> np.ndarray:
 
 
 def _cuts(old: Mesh, new: Mesh) -> int:
-    """Pieces a side of a new triangle, so that each is smaller than the old triangles."""
+    """Choose the pieces along a side of a new triangle, so that each is smaller than the old triangles."""
     return int(np.clip(np.ceil(2 * np.sqrt(len(old.faces) / len(new.faces))), 2, 12))
 
 
 class SurfaceCarrier:
-    """The vertices of one triangulation as points that ride on another one, both at rest."""
+    """The vertices of one triangulation (the riders) carried by another one (the ridden), both at rest."""
 
     def __init__(self, ridden: Mesh, rider: Mesh) -> None:
         self._on = Surface(ridden).closest(rider.vertices)
@@ -127,16 +127,16 @@ class SurfaceCarrier:
         self._off = np.einsum("nji,nj->ni", _frames(ridden.vertices[self._corners]), off)
 
     def positions(self, vertices: np.ndarray) -> np.ndarray:
-        """Where the riders (..., n, 3) are when the ridden vertices are at (..., N, 3), metres."""
+        """Compute the carried points (..., n, 3) for vertices (..., N, 3), metres."""
         corners = vertices[..., self._corners, :]
         return self._between(corners) + np.einsum("...nij,nj->...ni", _frames(corners), self._off)
 
     def displacements(self, fields: np.ndarray) -> np.ndarray:
-        """What the riders (..., n, 3) have of a small displacement (..., N, 3), metres."""
+        """Interpolate small displacements (..., N, 3), metres, at the carried points: (..., n, 3)."""
         return self._between(fields[..., self._corners, :])
 
     def values(self, values: np.ndarray) -> np.ndarray:
-        """What the riders (n, k) have of values (N, k) of the ridden vertices."""
+        """Interpolate values (N, k) of the vertices at the carried points: (n, k)."""
         return np.einsum("nc,nck->nk", self._on.bary, values[self._corners])
 
     def _between(self, corners: np.ndarray) -> np.ndarray:
@@ -144,7 +144,7 @@ class SurfaceCarrier:
 
 
 def _frames(corners: np.ndarray) -> np.ndarray:
-    """(..., 3, 3) an orthonormal frame, in columns, of triangles (..., 3, 3)."""
+    """Compute an orthonormal frame (..., 3, 3), in columns, of each triangle (..., 3, 3)."""
     first, second = corners[..., 1, :] - corners[..., 0, :], corners[..., 2, :] - corners[..., 0, :]
     normal = np.cross(first, second)
     normal /= np.linalg.norm(normal, axis=-1, keepdims=True)

@@ -138,7 +138,7 @@ def write_statue(folder: Path, name: str, scan: Mesh, statue: FittedStatue, rows
     write_mesh(folder / "reconstruction.ply", levels[-1].mesh)
     write_body(folder, statue)
     write_for_programs(folder, statue, levels[-1].mesh.vertices, fine, statue.upright_axis)
-    # how well control model and scan were brought together
+    # 1. how well the control model was registered to the scan
     rows = [judgement_row(judge_statue(statue, scan, levels[-1], doubts)), *rows,
             *([Metric("not seen in the scan", ", ".join(posed.missing))] if posed.missing else []),
             *([Metric("look at it", posed.problem)] if posed.problem else []),
@@ -147,7 +147,7 @@ def write_statue(folder: Path, name: str, scan: Mesh, statue: FittedStatue, rows
             Metric("surface points of it, RMS", MM * posed.features.point_rms, "mm"),
             Metric("control mesh to the scan, RMS", MM * surface.rms, "mm"),
             Metric("inverted triangles of the control mesh", surface.inverted)]
-    # what the map holds, and how far the surface made from it lies from the scan
+    # 2. what the map holds, and how far the reconstructed surface is from the scan
     shares, lacking = coverage_shares(control, statue.map), parts_without_data(statue)
     left = remaining_error(control, statue.map, scan)
     inverted = find_inverted(control, control.mesh.vertices, fine, levels[-1].mesh.vertices)
@@ -179,32 +179,32 @@ def judge_statue(statue: FittedStatue, scan: Mesh, finest: Level, left_out: Sequ
     """
     posed, shares = statue.posed, coverage_shares(statue.control, statue.map)
     assert posed is not None, "made by fit_statue"
-    told = (f"{100 * shares['folded']:.0f}% of the control mesh is folded against the scan, "
+    summary = (f"{100 * shares['folded']:.0f}% of the control mesh is folded against the scan, "
             f"{100 * shares['measured']:.0f}% has data one-to-one")
     missed = share_uncovered(scan, finest.mesh, 0.01 * float(np.sqrt(scan.face_areas.sum())))
     failed, check = [], list(left_out)
-    # share of the control mesh that is folded: persons who stand have up to 0.014, dressed ones 0.07 to 0.13, a half
-    # 0.08; and that is measured: persons seen from all sides have 0.85 to 0.94, a half 0.53
+    # shares of the control mesh. Folded: standing persons have up to 0.014, dressed ones 0.07 to 0.13, half a person
+    # 0.08. Measured: persons seen from all sides have 0.85 to 0.94, half a person 0.53.
     if shares["folded"] > 0.25 or shares["measured"] < 0.4:
-        failed.append(f"{told}; a part of a person only, or the control model is not where the person is: features "
+        failed.append(f"{summary}; a part of a person only, or the control model is not where the person is: features "
                       "given by hand (--features) may help")
     elif shares["folded"] > 0.06 or shares["measured"] < 0.75:
-        check.append(f"{told}; clothes and hair, a part of a person, or joints in wrong places: look at the page")
-    # off by more than a hundredth of its size: right ones have up to 0.003 of the scan, one in a coat 0.027, an arm
-    # clicked on the trunk 0.13, clicks of half the size 0.41
+        check.append(f"{summary}; clothes and hair, a part of a person, or joints in wrong places: look at the page")
+    # share of the scan farther off than a hundredth of its size: right statues have up to 0.003, one in a coat 0.027, an
+    # arm clicked on the trunk 0.13, clicks of half the size 0.41
     if missed > 0.02:
         (failed if missed > 0.25 else check).append(
             f"{100 * missed:.0f}% of the scan lies off the statue: joints in wrong places, or more than a person?")
-    # metres, mean: right ones have up to 0.0004, the paper's four people 0.0008, those in coats 0.0015 to 0.0032, legs
-    # that were clicked crossed 0.0014
+    # mean distance, metres: right statues have up to 0.0004, the paper's four people 0.0008, those in coats 0.0015 to
+    # 0.0032, crossed clicks of the legs 0.0014
     if finest.mean > 0.001:
         check.append(f"the detailed surface lies {MM * finest.mean:.1f} mm off the scan on average; folds, "
                      "or a limb lies in another's place")
-    amiss = np.fmax(posed.features.joint_rms, posed.features.point_rms)
-    # metres: right ones have up to 0.022, those in coats 0.043, left and right exchanged 0.039 of the joints and 0.096
-    # of the points
-    if amiss > 0.03:
-        check.append(f"features lie {MM * amiss:.0f} mm from those of the posed control model: left and right "
+    misfit = np.fmax(posed.features.joint_rms, posed.features.point_rms)
+    # metres: right statues have up to 0.022, those in coats 0.043; with left and right exchanged, joints have 0.039 and
+    # points 0.096
+    if misfit > 0.03:
+        check.append(f"features lie {MM * misfit:.0f} mm from those of the posed control model: left and right "
                      "exchanged, one in a wrong place, or clothes?")
     names, empty = statue.control.skeleton.names, {*parts_without_data(statue), *posed.missing}
     lacking = [in_words(name) for name in names if name in empty]
@@ -217,7 +217,7 @@ def judge_statue(statue: FittedStatue, scan: Mesh, finest: Level, left_out: Sequ
 
 
 def read_scan(inputs: ScanTask, unit: Unit | None) -> tuple[Mesh, Texture | None, list[Metric], list[str]]:
-    """The body of a scan and its texture in metres, what was left out, and whether that is doubtful.
+    """Read the body of a scan and its texture in metres, with figures and doubts of the cleaning.
 
     Without a unit it is metres where features are given, which may be on anything, else that of a person.
     """
@@ -229,7 +229,7 @@ def read_scan(inputs: ScanTask, unit: Unit | None) -> tuple[Mesh, Texture | None
     cleaned = clean_scan(scan.with_vertices(metre * scan.vertices))
     doubts = cleaning_doubts(cleaned)
     body = cleaned.mesh
-    if sought:                               # once more of the body alone: a floor may be of any size
+    if sought:                               # guess again from the body alone, since a floor may have any size
         likely = guess_person_unit(body.vertices / metre)
         body, metre = body.with_vertices(UNITS[likely] / metre * body.vertices), UNITS[likely]
         rows.append(Metric("unit of the scan", f"{likely}, from the height of the body"))
@@ -327,8 +327,8 @@ def animate(statue: StatueArg, motion: MotionArg, output: Output, model: Path | 
             for t, body in enumerate(bodies):
                 write_mesh(output / "meshes" / f"{t:05d}.ply", detailed.mesh(body))
                 progress(t + 1, len(bodies))
-    # inverted triangles of a frame: 100 poses of people have up to 0.002, a real walk 0.005; joint angles of noise
-    # 0.010, a walk whose degrees are taken for radians 0.012
+    # share of inverted triangles in a frame: 100 poses of people have up to 0.002, a real walk 0.005; random joint angles
+    # have 0.010, a walk with degrees read as radians 0.012
     inverted = [len(find_inverted(control, body, fine, detailed(body))) for body in shown]
     share = max(inverted) / len(fine.faces)
     doubts = [f"{100 * share:.1f}% of the triangles are inverted in a frame: the pose is beyond what the skin can "

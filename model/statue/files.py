@@ -4,7 +4,7 @@ from __future__ import annotations
 import io
 import re
 from pathlib import Path
-from xml.etree import ElementTree as xml
+from xml.etree import ElementTree
 
 import numpy as np
 
@@ -33,7 +33,29 @@ CONTROL, ABOUT, TEXTURE = "control.npz", "statue.json", "texture.png"
 
 
 def save_statue(folder: str | Path, statue: Statue) -> None:
-    """Write control.npz, statue.json, the images of the map and texture.png into a folder."""
+    """Write a statue into a folder: control.npz, statue.json, the images of the map, and texture.png.
+
+    Parameters
+    ----------
+    folder : str or Path
+        Folder to write; it is made if it does not exist.
+    statue : Statue
+        The statue.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> from model.statue.control.files import humanoid
+    >>> from model.statue.control.model import MEASURED, DisplacementMap
+    >>> flat = DisplacementMap(np.zeros((16, 16), np.float32), np.full((16, 16), MEASURED, np.uint8))
+    >>> statue = Statue(humanoid(), np.zeros((len(humanoid().skeleton.parents), 3)), flat)
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     save_statue(folder, statue)
+    ...     load_statue(folder).map.heights.shape
+    (16, 16)
+
+    [Statues]
+    """
     from PIL import Image
 
     folder = Path(folder)
@@ -48,17 +70,34 @@ def save_statue(folder: str | Path, statue: Statue) -> None:
 
 
 def load_statue(folder: str | Path, edited: str | Path | None = None) -> Statue:
-    """Read a folder of `save_statue`.
+    """Read a statue from a folder of `save_statue`.
 
     Parameters
     ----------
-    edited : path, optional
-        An edited copy of displacement.png: where it differs from the image of the folder, its heights count.
+    folder : str or Path
+        Folder of a statue.
+    edited : str or Path, optional
+        An edited copy of displacement.png. Where it differs from the image of the folder, its heights are used.
+
+    Returns
+    -------
+    Statue
+        Control model, pose (J, 3) in radians, displacement map and texture.
 
     Raises
     ------
     StorageError
-        Missing, not a statue, a version that is not known, an image of another size or depth.
+        The folder is missing or no statue, of an unknown version, or the image has another size or depth.
+
+    Examples
+    --------
+    >>> try:
+    ...     load_statue("no such folder")
+    ... except storage.StorageError as error:
+    ...     print(type(error).__name__)
+    StorageError
+
+    [Statues]
     """
     from PIL import Image
 
@@ -96,8 +135,11 @@ def write_body(folder: Path, statue: Statue) -> None:
 
 
 def body_model(control: ControlModel, poses: np.ndarray | None = None) -> SkinningModel:
-    """The control model under linear blend skinning as a model of one person, without betas. The poses (M, J, 3) that
-    people take make the pose prior; without any all rotations are about as likely. [Statues] Eq. 1
+    """Convert a control model to a skinning model of one person, without betas.
+
+    The poses (M, J, 3) that people take give the pose prior; without any, all rotations are about as likely.
+
+    [Statues] Eq. 1
     """
     skeleton, N = control.skeleton, len(control.mesh.vertices)
     J = len(skeleton.parents)
@@ -159,65 +201,65 @@ def write_x3d(path: str | Path, control: ControlModel, texture: np.ndarray | Non
     """
     path = Path(path)
     U = turn_up(up).T
-    root = xml.Element("X3D", profile="Full", version="4.0")
-    head = xml.SubElement(root, "head")
-    xml.SubElement(head, "meta", name="generator", content="scapekit")
-    scene = xml.SubElement(root, "Scene")
+    root = ElementTree.Element("X3D", profile="Full", version="4.0")
+    head = ElementTree.SubElement(root, "head")
+    ElementTree.SubElement(head, "meta", name="generator", content="scapekit")
+    scene = ElementTree.SubElement(root, "Scene")
     names = _names(control)
-    person = xml.SubElement(scene, "HAnimHumanoid", DEF="statue", name="statue", version="2.0")
+    person = ElementTree.SubElement(scene, "HAnimHumanoid", DEF="statue", name="statue", version="2.0")
     _skeleton(person, control, names, U)
     for name in names:
-        xml.SubElement(person, "HAnimJoint", USE=name, containerField="joints")
+        ElementTree.SubElement(person, "HAnimJoint", USE=name, containerField="joints")
     image = None if texture is None else path.with_suffix(".png").name
     _skin(person, control.mesh.with_vertices(control.mesh.vertices @ U), control.chart, image)
     if texture is not None:
         save_png(path.with_suffix(".png"), texture)
-    xml.indent(root, " ")
+    ElementTree.indent(root, " ")
     with storage.writing(path) as beside:
         doctype = ('<?xml version="1.0" encoding="UTF-8"?>\n<!DOCTYPE X3D PUBLIC "ISO//Web3D//DTD X3D 4.0//EN" '
                    '"https://www.web3d.org/specifications/x3d-4.0.dtd">\n')
-        beside.write_text(doctype + xml.tostring(root, encoding="unicode") + "\n", encoding="utf-8")
+        beside.write_text(doctype + ElementTree.tostring(root, encoding="unicode") + "\n", encoding="utf-8")
 
 
 def _names(control: ControlModel) -> list[str]:
-    """Names of the parts as XML takes them for an identity."""
+    """Make the names of the parts valid and unique as XML identifiers."""
     plain = [re.sub(r"[^A-Za-z0-9_]", "_", name) for name in control.skeleton.names]
     plain = [name if name[:1].isalpha() else f"part_{name}" for name in plain]
     return [name if plain.count(name) == 1 and name != "statue" else f"{name}_{j}" for j, name in enumerate(plain)]
 
 
-def _skeleton(person: xml.Element, control: ControlModel, names: list[str], U: np.ndarray) -> None:
-    nodes: list[xml.Element] = []
+def _skeleton(person: ElementTree.Element, control: ControlModel, names: list[str], U: np.ndarray) -> None:
+    nodes: list[ElementTree.Element] = []
     weights = strongest(control.weights)
     renamed = {"wrist": "radiocarpal", "ankle": "talocrural"}       # joints that H-Anim 2.0 calls otherwise than 1.0
     for j, parent in enumerate(control.skeleton.parents):
         carried = np.flatnonzero(weights[:, j])
-        nodes.append(xml.SubElement(
+        nodes.append(ElementTree.SubElement(
             nodes[parent] if j else person, "HAnimJoint", DEF=names[j],
             name=re.sub("^([lr]_)(wrist|ankle)$", lambda found: found[1] + renamed[found[2]], names[j]),
             containerField="children" if j else "skeleton", center=_row(control.skeleton.joints[j] @ U),
             skinCoordIndex=" ".join(map(str, carried)), skinCoordWeight=_row(weights[carried, j])))
 
 
-def _skin(person: xml.Element, mesh: Mesh, chart: Chart, image: str | None) -> None:
+def _skin(person: ElementTree.Element, mesh: Mesh, chart: Chart, image: str | None) -> None:
     def rows(values: np.ndarray) -> str:
         return ", ".join(map(_row, values))
 
     def corners(faces: np.ndarray) -> str:
         return " ".join(f"{a} {b} {c} -1" for a, b, c in faces)
 
-    xml.SubElement(person, "Coordinate", DEF="skin_points", containerField="skinCoord", point=rows(mesh.vertices))
-    xml.SubElement(person, "Normal", DEF="skin_normals", containerField="skinNormal", vector=rows(mesh.vertex_normals))
-    shape = xml.SubElement(person, "Shape", containerField="skin")
-    look = xml.SubElement(shape, "Appearance")
-    xml.SubElement(look, "Material", diffuseColor="0.8 0.77 0.74" if image is None else "1 1 1")
+    ElementTree.SubElement(person, "Coordinate", DEF="skin_points", containerField="skinCoord", point=rows(mesh.vertices))
+    ElementTree.SubElement(person, "Normal", DEF="skin_normals", containerField="skinNormal", vector=rows(mesh.vertex_normals))
+    shape = ElementTree.SubElement(person, "Shape", containerField="skin")
+    look = ElementTree.SubElement(shape, "Appearance")
+    ElementTree.SubElement(look, "Material", diffuseColor="0.8 0.77 0.74" if image is None else "1 1 1")
     if image is not None:
-        xml.SubElement(look, "ImageTexture", url=f'"{image}"', repeatS="false", repeatT="false")
-    surface = xml.SubElement(shape, "IndexedFaceSet", coordIndex=corners(mesh.faces),
+        ElementTree.SubElement(look, "ImageTexture", url=f'"{image}"', repeatS="false", repeatT="false")
+    surface = ElementTree.SubElement(shape, "IndexedFaceSet", coordIndex=corners(mesh.faces),
                              texCoordIndex=corners(chart.faces))
-    xml.SubElement(surface, "Coordinate", USE="skin_points")
-    xml.SubElement(surface, "Normal", USE="skin_normals")
-    xml.SubElement(surface, "TextureCoordinate", point=rows(chart.uv))
+    ElementTree.SubElement(surface, "Coordinate", USE="skin_points")
+    ElementTree.SubElement(surface, "Normal", USE="skin_normals")
+    ElementTree.SubElement(surface, "TextureCoordinate", point=rows(chart.uv))
 
 
 def _row(values: np.ndarray) -> str:

@@ -1,4 +1,4 @@
-"""From one scan to a statue: registration by features, shape-constrained fit, displacement map."""
+"""Fit a statue to one scan: registration by features, shape-constrained surface fit, displacement map."""
 from __future__ import annotations
 
 from collections.abc import Mapping
@@ -30,10 +30,19 @@ class StatueConfig(Settings):
     Attributes
     ----------
     surface : SurfaceFitConfig
+        Settings of the fit of the control mesh.
     displacement : DisplacementConfig
-    start : "registered" or "posed"
-        Without features, the fit of the surface begins at the control mesh as it was registered to the scan, or, as
-        from clicks in the paper, at the control model posed by the features that were found, its head warped to them.
+        Settings of the displacement map.
+    start : {"registered", "posed"}
+        Start of the surface fit where no features are given. "registered" is the control mesh registered to the scan.
+        "posed", as in the paper, is the control model posed by the features that were found, with its head warped.
+
+    Examples
+    --------
+    >>> StatueConfig.from_paper().start
+    'posed'
+
+    [Statues]
     """
 
     surface: SurfaceFitConfig = field(default_factory=SurfaceFitConfig)
@@ -42,14 +51,14 @@ class StatueConfig(Settings):
 
     @classmethod
     def from_paper(cls) -> StatueConfig:
-        """The control model posed by features, its head warped, its mesh fitted by the steps of the paper alone.
+        """Return the paper's settings: the control model posed by features, its head warped, its mesh fitted as there.
 
-        Not as in the paper: without --features joints and landmarks are found by a search, which the paper has clicked.
-        Eq. 4 has a weak prior (1 mm for a radian or a double length), Eq. 5 the φ(p - p_k) that interpolates. A click
-        on a picture goes to the medial curves of the body, not to its medial surface. Vertices past the edge of a hole
-        of the scan are carried by the shape. What is folded under the scan after the fit is drawn out of it. Heights
-        are the cubic root that Eq. 19 asks for, and are filled smoothly where there is none. Adaptive triangles are
-        small where the displaced surface bends away from their edges, not where the displacement is greater.
+        Not as in the paper: without --features, a search finds joints and landmarks, which the paper has clicked. Eq. 4
+        has a weak prior (1 mm for a radian or a double length), and Eq. 5 the φ(p - p_k) that interpolates. A click on
+        a picture goes to medial curves of the body, not to its medial surface. The shape carries vertices past the edge
+        of a hole of the scan. Folds that remain after the fit are opened. Heights solve the cubic of Eq. 19, and are
+        filled smoothly where there is no solution. Adaptive triangles are small where the displaced surface is curved,
+        not where the displacement is large.
         """
         return cls(surface=SurfaceFitConfig.from_paper(), start="posed")
 
@@ -78,71 +87,86 @@ def fit_statue(scan: Mesh, joints: Mapping[str, np.ndarray] | None = None,
                points: Mapping[str, np.ndarray] | None = None, control: ControlModel | None = None,
                config: StatueConfig | None = None, progress: Progress | None = None, step: Step = run_uncached
                ) -> FittedStatue:
-    """One scan of one person as a character that moves, with all its detail.
+    """Fit a character that moves, with all its detail, to one scan of one person.
 
     Parameters
     ----------
     scan : Mesh, metres
-        One body, floor and furniture taken off (`clean_scan`); it may have holes, which the map then has too.
-    joints : {name of a joint: (3,) float, metres}, optional
-        Joint centres. Without any, a person who stands upright is found by `find_features`.
-    points : {name of a landmark: (3,) float, metres}, optional
-        Points of the face and of the rest of the surface.
+        One body without floor and furniture (`clean_scan`). It may have holes, which the map then has too.
+    joints : dict of str to (3,) float, metres, optional
+        Joint centres by name. Without features, `find_features` finds a person who stands upright.
+    points : dict of str to (3,) float, metres, optional
+        Landmarks of the face and of the rest of the surface, by name.
     control : ControlModel, optional
-        `humanoid()` when not given.
+        By default `humanoid()`.
     config : StatueConfig, optional
+        Settings.
     progress : callable, optional
         Called as progress(done, total).
     step : Step, optional
-        Keeps the results of the stages, so that work which was interrupted goes on.
+        Keeps the results of the stages, so that an interrupted fit resumes.
+
+    Returns
+    -------
+    FittedStatue
+        A `Statue` with the results of the stages.
 
     Raises
     ------
     ValueError
-        A scan without triangles, one in which no person is found, features that say too little.
+        A scan without triangles, no person in it, or too few features.
+
+    Examples
+    --------
+    >>> from scanprep import Mesh
+    >>> try:
+    ...     fit_statue(Mesh(np.eye(3), [[0, 1, 2]]))
+    ... except ValueError as error:
+    ...     print(str(error)[:52])
+    scan: expected a person of at least 100 points, got 
 
     [Statues]
     """
     control, config, scan = control or humanoid(), config or StatueConfig(), sanitise(scan)
-    given = (scan, joints, points, control)
+    inputs = (scan, joints, points, control)
     if joints is None and points is None:
-        found = step("features", given, lambda: find_features(control, scan))
-        posed = pose_automatically(control, found, config.start == "registered")                # [Statues] Eq. 4-5
+        features = step("features", inputs, lambda: find_features(control, scan))
+        posed = pose_automatically(control, features, config.start == "registered")                # [Statues] Eq. 4-5
     else:
         posed = pose_by_features(control, joints or {}, points or {})                           # [Statues] Eq. 1-5
-    surface = step("surface", (given, config), lambda: fit_surface(
+    surface = step("surface", (inputs, config), lambda: fit_surface(
         control.mesh, posed.start, scan, config.surface, progress, posed.hidden))                # [Statues] Eq. 6-18
-    fitted = step("control", (given, config), lambda: fit_control(
+    fitted = step("control", (inputs, config), lambda: fit_control(
         control, posed.features, surface, scan, config.displacement))
-    map = step("map", (given, config), lambda: bake_displacement(
+    map = step("map", (inputs, config), lambda: bake_displacement(
         fitted, scan, config.displacement, progress))                                            # [Statues] Eq. 19-21
     return FittedStatue(fitted, posed.features.pose, map, posed=posed, surface=surface)
 
 
 def pose_by_features(control: ControlModel, joints: Mapping[str, np.ndarray], points: Mapping[str, np.ndarray]
                      ) -> Posed:
-    """The control model posed by features, and its head warped to those of the face."""
+    """Pose the control model by features, and warp its head to those of the face."""
     return with_head(control, fit_features(control, joints, points), points)                     # [Statues] Eq. 4
 
 
 def with_head(control: ControlModel, fit: FeatureFit, points: Mapping[str, np.ndarray]) -> Posed:
-    """A control model that was posed by features, its head warped to the points of the face. [Statues] Eq. 5"""
+    """Warp the head of a control model that was posed by features to the points of the face. [Statues] Eq. 5"""
     start, face = fit.vertices, [name for name in FACE if name in points]
     if "skullbase" not in control.skeleton.names:
         face = []
     try:
         own, goal = start[[control.landmarks[name] for name in face]], np.array([points[name] for name in face])
         start = warp(start, own, goal, head_share(control)) if face else start
-    except ValueError:                   # fewer than four, or in one plane: they say nothing of the shape of a head
+    except ValueError:                   # fewer than four points, or all in one plane, do not determine a head
         face = []
     return Posed(fit, start, np.zeros(len(start), dtype=bool), len(face))
 
 
 def pose_automatically(control: ControlModel, found: Features, registered: bool = True) -> Posed:
-    """The control model where `find_features` found the person, posed and its head warped as by features given.
+    """Pose the control model where `find_features` found the person, and warp its head.
 
-    If `registered`, its surface begins on the scan; only parts whose joint the scan does not show stand as the pose
-    says. A start by the pose alone left 1.4% of a real scan folded, this one 0.3%.
+    If `registered`, its surface begins on the scan, except for parts whose joint the scan does not show. A start by the
+    pose alone left 1.4% of a real scan folded, this one 0.3%.
     """
     if found.fit is None or found.registered is None:
         raise ValueError(f"scan: {found.problem}")
@@ -158,7 +182,7 @@ def pose_automatically(control: ControlModel, found: Features, registered: bool 
 
 def fit_control(control: ControlModel, posed: FeatureFit, surface: SurfaceFit, scan: Mesh,
                 config: DisplacementConfig | None = None) -> ControlModel:
-    """The control model on the scan, drawn out of folds, its joints where the features put them."""
+    """Build the control model on the scan, with folds opened and its joints where the features put them."""
     unfolded = unfold_control(control.refit(surface.vertices, posed.joints), scan, config).mesh.vertices
     root = unfolded[control.skeleton.part_of_vertex(control.mesh) == 0].mean(axis=0)
     return control.refit(unfolded, np.vstack([root, posed.joints[1:]]))

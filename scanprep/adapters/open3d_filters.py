@@ -1,4 +1,4 @@
-"""Filters of open3d, which needs the graphics libraries of the system even for geometry."""
+"""Filters of Open3D, which needs the graphics libraries of the system even for geometry."""
 from __future__ import annotations
 
 import importlib
@@ -11,20 +11,21 @@ from ..geometry.surface import Surface
 
 
 class MissingLibrary(ImportError):
-    """A library that a setting asks for is not there, or not the system's libraries it stands on."""
+    """A library that a setting asks for, or a system library it needs, is missing."""
 
 
 def open3d_decimation(mesh: Mesh, faces: int) -> Mesh:
-    """Fewer triangles by open3d's quadric error collapses."""
+    """Decimate by Open3D's quadric error collapses."""
     o3d = library("open3d")
-    whole = o3d.geometry.TriangleMesh(o3d.utility.Vector3dVector(np.array(mesh.vertices)),      # it wants its own
+    # copies, as Open3D needs arrays of its own
+    whole = o3d.geometry.TriangleMesh(o3d.utility.Vector3dVector(np.array(mesh.vertices)),
                                       o3d.utility.Vector3iVector(mesh.faces.astype(np.int32)))
     smaller = whole.simplify_quadric_decimation(faces)
     return Mesh(np.asarray(smaller.vertices), np.asarray(smaller.triangles))
 
 
 def open3d_poisson(mesh: Mesh, depth: int = 8) -> Mesh:
-    """A closed surface near the mesh by screened Poisson reconstruction from its vertices and normals."""
+    """Reconstruct a closed surface from vertices and normals by screened Poisson reconstruction."""
     o3d = library("open3d")
     cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(np.array(mesh.vertices)))
     cloud.normals = o3d.utility.Vector3dVector(np.array(mesh.vertex_normals))
@@ -33,28 +34,28 @@ def open3d_poisson(mesh: Mesh, depth: int = 8) -> Mesh:
 
 
 def estimate_oriented_normals(points: np.ndarray) -> np.ndarray:
-    """Unit normals (n, 3) of points (n, 3), metres, that face the same way along the surface; inward or outward."""
+    """Estimate unit normals (n, 3) of points (n, 3), metres, with one orientation, inward or outward."""
     o3d = library("open3d")
     cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(np.array(points)))
-    neighbours = 20  # points that tell a normal, and to which it is oriented
+    neighbours = 20  # for the normal and for its orientation; about the first two rings
     cloud.estimate_normals(o3d.geometry.KDTreeSearchParamKNN(neighbours))
     cloud.orient_normals_consistent_tangent_plane(neighbours)
     return np.asarray(cloud.normals).copy()
 
 
 def reconstruct_screened_poisson(points: np.ndarray, normals: np.ndarray, spacing: float) -> Mesh:
-    """A surface by screened Poisson reconstruction, its cells as large as the spacing of the points, metres."""
+    """Reconstruct a surface by screened Poisson reconstruction, with cells of about the point spacing, metres."""
     o3d = library("open3d")
     cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(np.array(points)))
     cloud.normals = o3d.utility.Vector3dVector(np.array(normals))
-    # octree of Poisson reconstruction: cells of 2 mm on a person
+    # octree depth for cells of one spacing; between 6 and 10, where cells are 2 mm on a person
     depth = int(np.clip(np.ceil(np.log2(1.1 * np.ptp(points, axis=0).max() / spacing)), 6, 10))
     found, _ = o3d.geometry.TriangleMesh.create_from_point_cloud_poisson(cloud, depth=depth, n_threads=1)
     return Mesh(np.asarray(found.vertices), np.asarray(found.triangles).astype(np.int64))
 
 
 def ball_pivoting(points: np.ndarray, normals: np.ndarray, spacing: float) -> Mesh:
-    """Triangles between the points where balls of 1.5, 2.5 and 4 times their spacing come to rest on three of them."""
+    """Mesh points by ball pivoting, with balls of 1.5, 2.5 and 4 times their spacing, metres."""
     o3d = library("open3d")
     cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(np.array(points)))
     cloud.normals = o3d.utility.Vector3dVector(np.array(normals))
@@ -64,7 +65,7 @@ def ball_pivoting(points: np.ndarray, normals: np.ndarray, spacing: float) -> Me
 
 
 def recolor(mesh: Mesh, source: Mesh) -> Mesh:
-    """The mesh with the colours of the closest points of another one, when that has any."""
+    """Colour a mesh by the closest points of another one, if that has colours."""
     if source.colors is None:
         return mesh
     at = Surface(source).closest(mesh.vertices)
@@ -72,7 +73,7 @@ def recolor(mesh: Mesh, source: Mesh) -> Mesh:
 
 
 def library(name: str) -> Any:
-    """The module open3d or pymeshlab, or MissingLibrary."""
+    """Import open3d or pymeshlab; MissingLibrary with advice if that fails."""
     try:
         return importlib.import_module(name)
     except (ImportError, OSError) as error:

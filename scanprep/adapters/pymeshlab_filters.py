@@ -16,7 +16,7 @@ from .open3d_filters import library, recolor
 
 
 def meshlab_decimation(mesh: Mesh, faces: int) -> Mesh:
-    """Fewer triangles by MeshLab's quadric edge collapses, keeping the topology."""
+    """Decimate by MeshLab's quadric edge collapses, keeping the topology."""
     meshes = _meshes(mesh)
     meshes.meshing_decimation_quadric_edge_collapse(targetfacenum=faces, preservetopology=True,
                                                     preserveboundary=True)
@@ -24,30 +24,31 @@ def meshlab_decimation(mesh: Mesh, faces: int) -> Mesh:
 
 
 def meshlab_poisson(mesh: Mesh, depth: int = 8) -> Mesh:
-    """A closed surface near the mesh by screened Poisson reconstruction."""
+    """Reconstruct a closed surface near the mesh by screened Poisson reconstruction."""
     meshes = _meshes(mesh)
     meshes.generate_surface_reconstruction_screened_poisson(depth=depth, threads=threads_asked() or 1)
     return recolor(_result(meshes), mesh)
 
 
 def read_layers(path: str) -> dict[str, np.ndarray]:
-    """The vertices, triangles, colours and names of all layers that MeshLab finds in a file, each at its place."""
+    """Read vertices, triangles, colours and names of all layers of a file with MeshLab, each layer in its place."""
     meshes = library("pymeshlab").MeshSet()
     meshes.load_new_mesh(path)
     layers = list(meshes)
     counts = [layer.vertex_number() for layer in layers]
     starts = np.cumsum([0, *counts[:-1]])
-    found = {"vertices": np.concatenate([layer.transformed_vertex_matrix() for layer in layers]),
+    arrays = {"vertices": np.concatenate([layer.transformed_vertex_matrix() for layer in layers]),
              "faces": np.concatenate([layer.face_matrix().astype(np.int64) + start
                                       for layer, start in zip(layers, starts, strict=True)]),
              "names": np.array([layer.label() or f"layer {k}" for k, layer in enumerate(layers)]),
              "triangles": np.array([layer.face_number() for layer in layers])}
     if all(layer.has_vertex_color() for layer in layers):
-        found["colors"] = np.concatenate([layer.vertex_color_matrix()[:, :3] for layer in layers])
-    return found
+        arrays["colors"] = np.concatenate([layer.vertex_color_matrix()[:, :3] for layer in layers])
+    return arrays
 
 
 def _meshes(mesh: Mesh) -> Any:
+    """Put a mesh into a MeshSet."""
     pymeshlab = library("pymeshlab")
     meshes = pymeshlab.MeshSet()
     meshes.add_mesh(pymeshlab.Mesh(vertex_matrix=mesh.vertices, face_matrix=mesh.faces.astype(np.int32),
@@ -56,6 +57,7 @@ def _meshes(mesh: Mesh) -> Any:
 
 
 def _result(meshes: Any) -> Mesh:
+    """Return the current mesh of a MeshSet."""
     current = meshes.current_mesh()
     return Mesh(current.vertex_matrix(), current.face_matrix())
 

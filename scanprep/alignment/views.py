@@ -1,4 +1,4 @@
-"""Range views with rough camera poses brought together, all at once."""
+"""Align range views with rough camera poses, all views at once."""
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
@@ -23,15 +23,15 @@ class AlignViewsConfig(Settings):
     Attributes
     ----------
     iterations : int
-        Most rounds of matching.
+        Largest number of matching rounds.
     reach : float, metres
-        Farthest match of the first round; later ones keep three times the median distance.
+        Largest distance of a match in the first round; later rounds allow three times the median distance.
     border : float, metres
-        Points nearer to the border of their view do not count.
+        Points nearer than this to the border of their view are not matched.
     min_overlap : float
-        Share of a view that others must have seen as well for its place to be trusted.
+        Least share of a view that others also saw; with less, its pose is not trusted.
     max_conflict : float
-        Share of a view that others may look through before its place is not trusted.
+        Largest share of a view that may violate free space of others; with more, its pose is not trusted.
     """
 
     iterations: Count = 60
@@ -47,12 +47,12 @@ class AlignedViews:
 
     views: list[tuple[Mesh, np.ndarray]]     # moved surfaces and camera positions, ready for `merge_views`
     T_world_view: np.ndarray                 # (V, 4, 4) the motion of each view; the first one stays
-    rms: float                               # metres, of the distances between matched points and planes, in the end
+    rms: float                               # metres, RMS point-to-plane distance of the matches at the end
     converged: bool
     iterations: int
-    overlap: np.ndarray                      # (V,) share of each view that others saw as well
-    conflict: np.ndarray                     # (V,) share that others look through, which no view in place has
-    trusted: np.ndarray                      # (V,) came to rest, overlaps and contradicts no other; else do not merge
+    overlap: np.ndarray                      # (V,) share of each view that others also saw
+    conflict: np.ndarray                     # (V,) share that violates free space of others; 0 for a correct pose
+    trusted: np.ndarray                      # (V,) converged, enough overlap, little conflict; else do not merge
 
 
 def align_views(views: Sequence[Any], config: AlignViewsConfig | None = None,
@@ -60,21 +60,23 @@ def align_views(views: Sequence[Any], config: AlignViewsConfig | None = None,
                 landmarks: Sequence[Mapping[str, np.ndarray]] | None = None, features: bool = False) -> AlignedViews:
     """Refine rough camera poses by point-to-plane matching between all pairs of views together.
 
-    `views` are RangeViews, or pairs of a Mesh and a camera position (3,), a few centimetres and degrees from where they
-    belong; further off only where `landmarks` (one mapping name -> (3,) point a view, each name in two views or more)
-    or `features`, their shapes alone, place them first. `rng` draws the points that look for matches. ValueError for
-    no views.
+    `views` are RangeViews, or pairs of a Mesh and a camera position (3,), within a few centimetres and degrees of their
+    true poses. Larger errors need `landmarks` (per view one mapping name -> (3,) point, each name in at least two
+    views) or `features` (shape alone) to place them first. `rng` draws the points that are matched. ValueError for no
+    views.
     """
     config, rng = config or AlignViewsConfig(), rng or np.random.default_rng(0)
     pairs = [mesh_and_camera(view) for view in views]
     if not pairs:
         raise ValueError("views: expected at least one, got none")
+    # rough poses first, where landmarks or features give them
     start = np.tile(np.eye(4), (len(pairs), 1, 1))
     if landmarks is not None:
         start = place_by_landmarks(landmarks, len(pairs))
     elif features:
         start = place_by_features(pairs, rng)
     pairs = [_move(pair, T) for pair, T in zip(pairs, start, strict=True)]
+    # ICP over all pairs: match, solve for all motions together, tighten the reach
     samples = [_sample(mesh, config, rng) for mesh, _ in pairs]
     poses = np.tile(np.eye(4), (len(pairs), 1, 1))
     reach, rms, settled, rounds = config.reach, np.nan, len(pairs) == 1, 0
@@ -90,6 +92,7 @@ def align_views(views: Sequence[Any], config: AlignViewsConfig | None = None,
         poses = steps @ poses
         rms, settled, rounds = float(np.sqrt(np.mean(residual**2))), moved < 5e-5, rounds + 1
         distances = np.concatenate([d for *_, d in matches])
+        # never below 5 mm, so that noise cannot end the matching
         reach = min(reach, max(3 * float(np.median(distances)), 0.005))
     out = [_move(pair, T) for pair, T in zip(pairs, poses, strict=True)]
     overlap, conflict = fit_of_views(out)
@@ -98,13 +101,14 @@ def align_views(views: Sequence[Any], config: AlignViewsConfig | None = None,
 
 
 def _move(view: tuple[Mesh, np.ndarray], T: np.ndarray) -> tuple[Mesh, np.ndarray]:
+    """Move a view and its camera by a rigid transform (4, 4)."""
     mesh, camera = view
     return mesh.with_vertices(mesh.vertices @ T[:3, :3].T + T[:3, 3]), T[:3, :3] @ camera + T[:3, 3]
 
 
 def _sample(mesh: Mesh, config: AlignViewsConfig, rng: np.random.Generator
               ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Points of a view, their normals, and which of them lie well inside."""
+    """Draw at most 16,000 points of a smoothed view, their normals, and which lie well inside its border."""
     even = smooth_taubin(mesh, 10)
     inner = border_distance(mesh, config.border) >= config.border
     chosen = rng.permutation(len(mesh.vertices))[:16_000]
@@ -113,29 +117,30 @@ def _sample(mesh: Mesh, config: AlignViewsConfig, rng: np.random.Generator
 
 def _match(placed: list[tuple[np.ndarray, np.ndarray]], inner: list[np.ndarray], reach: float,
            ) -> list[tuple[int, int, np.ndarray, np.ndarray, np.ndarray]]:
-    """For every pair of views (i, j): points of i, their matches in j, distances."""
-    found = []
+    """Match every pair of views (i, j): points of i, their matches in j, distances; at least 30 matches per pair."""
+    matches = []
     for j, (points, normals) in enumerate(placed):
         target = OrientedPoints(points, normals)
-        for i, (mine, my_normals) in enumerate(placed):
+        for i, (source_points, source_normals) in enumerate(placed):
             if i == j:
                 continue
-            rows = np.flatnonzero(inner[i][:4000])         # of many points few look for matches
-            match = target.match(mine[rows], my_normals[rows], reach, 0.8)
+            rows = np.flatnonzero(inner[i][:4000])         # 4,000 points are enough to match from
+            match = target.match(source_points[rows], source_normals[rows], reach, 0.8)
             good = match.valid & inner[j][np.maximum(match.index, 0)]
             if good.sum() >= 30:
-                found.append((i, j, rows[good], match.index[good], match.distances[good]))
-    return found
+                matches.append((i, j, rows[good], match.index[good], match.distances[good]))
+    return matches
 
 
 def _solve(placed: list[tuple[np.ndarray, np.ndarray]],
            matches: list[tuple[int, int, np.ndarray, np.ndarray, np.ndarray]]) -> tuple[np.ndarray, np.ndarray]:
-    """Small motions (V, 4, 4) of all views but the first that lessen the point-to-plane distances most."""
+    """Solve for small motions (V, 4, 4) of all views but the first that minimise point-to-plane distances."""
     count = len(placed)
     A, b, residuals = np.zeros((6 * count, 6 * count)), np.zeros(6 * count), []
     centre = np.concatenate([p for p, _ in placed]).mean(axis=0)
     for i, j, rows, targets, _ in matches:
         x, y, n = placed[i][0][rows] - centre, placed[j][0][targets] - centre, placed[j][1][targets]
+        # a match moves with both of its views: Jacobian J for view i, -J for view j
         residual = np.einsum("nd,nd->n", n, x - y)
         J = np.concatenate([np.cross(x, n), n], axis=1)
         JJ, Jr = J.T @ J, J.T @ residual
@@ -157,12 +162,12 @@ def _solve(placed: list[tuple[np.ndarray, np.ndarray]],
 
 
 def views_doubts(found: AlignedViews, names: Sequence[str]) -> list[str]:
-    """Why aligned views, by name, are to be looked at: the place of some is uncertain."""
+    """Explain which aligned views, by name, need a look because their pose is uncertain."""
     return [f"the place of {name} is uncertain" for name, sure in zip(names, found.trusted, strict=True) if not sure]
 
 
 def views_problem(found: AlignedViews) -> str | None:
-    """Why aligned views mean nothing; None where some are in place."""
+    """Explain why aligned views are meaningless; None where some poses are trusted."""
     if found.trusted.any():
         return None
     return (f"no view is in its place, they share {100 * float(found.overlap.max()):.0f}% of their surface at most; "

@@ -1,6 +1,6 @@
-"""What a command was called with, kept in the folder that it wrote: the same can be done again from elsewhere.
+"""The call of a command, kept in the folder that it wrote, so that the same work can be repeated later.
 
-In the folder itself, or with the rest of what scapekit knows of it.
+It is in the folder itself, or in its `.scapekit` folder.
 """
 from __future__ import annotations
 
@@ -16,31 +16,39 @@ from ..ranges import Settings
 from .digests import with_paths
 from .ownership import HOME
 
+# name of the file, version of its format, and what its kind begins with; all three are in files of users
 RUN, VERSION, CALL = "run.json", 1, "call of "
 Of = TypeVar("Of", bound="KeptCall")
 
 
 @dataclass(frozen=True)
 class KeptCall:
-    """The call of one command; each has its own class, with a field `config` for the settings.
+    """The call of one command; each command has a class of its own, with the settings in a field `config`.
 
     `run.json` holds absolute paths, and the settings as `--write-config` prints them.
     """
 
     command: ClassVar[str]
-    may_be_files: ClassVar[tuple[str, ...]] = ()         # fields with a text that is a word or names a file
+    may_be_files: ClassVar[tuple[str, ...]] = ()         # text fields that hold a keyword or a file name
 
     def write(self, folder: Path) -> None:
-        """Keep it in a folder."""
-        given: dict[str, Any] = {f.name: with_paths(getattr(self, f.name), Path.absolute) for f in fields(self)}
-        given |= {name: str(Path(given[name]).absolute()) for name in self.may_be_files
-                  if given[name] is not None and Path(given[name]).exists()}
-        given["config"] = config_files.write_settings({"config": given["config"]})
-        storage.write_json(folder / RUN, {"kind": _kind(self), "version": VERSION, **given})
+        """Write the call into a folder."""
+        stored: dict[str, Any] = {f.name: with_paths(getattr(self, f.name), Path.absolute) for f in fields(self)}
+        # a text that names an existing file becomes an absolute path; a keyword stays as it is
+        stored |= {name: str(Path(stored[name]).absolute()) for name in self.may_be_files
+                  if stored[name] is not None and Path(stored[name]).exists()}
+        stored["config"] = config_files.write_settings({"config": stored["config"]})
+        storage.write_json(folder / RUN, {"kind": _kind(self), "version": VERSION, **stored})
 
     @classmethod
     def read(cls: type[Of], folder: Path) -> Of:
-        """That of a folder; StorageError for one that does not tell."""
+        """Read the call kept in a folder.
+
+        Raises
+        ------
+        StorageError
+            The folder keeps no call of this command.
+        """
         import msgspec
 
         path = _file(folder)
@@ -48,31 +56,33 @@ class KeptCall:
             raise storage.StorageError(f"{folder}: it does not tell what it was made from, as what {cls.command} made "
                                        "earlier does not; run the same command once more")
         with storage.taking_apart(path, f"a {_kind(cls)}"):
-            told = storage.read_json(path, f"a {_kind(cls)}")
-            if told.pop("kind") != _kind(cls) or told.pop("version") != VERSION:
+            stored = storage.read_json(path, f"a {_kind(cls)}")
+            if stored.pop("kind") != _kind(cls) or stored.pop("version") != VERSION:
                 raise ValueError(f"kind and version are not those of a {_kind(cls)} that is known here")
             hints = typing.get_type_hints(cls)
-            usual: Callable[[], Settings] = hints["config"]
-            config = config_files.parse_settings(told.pop("config"), path, {"config": usual()})["config"]
-            # values of JSON in the types of the fields: Path, text, one of some words, tuples of these, or None
+            default_config: Callable[[], Settings] = hints["config"]
+            config = config_files.parse_settings(stored.pop("config"), path, {"config": default_config()})["config"]
+            # convert JSON values to the types of the fields: Path, text, keyword, tuples of these, or None
             return cls(**{name: msgspec.convert(value, hints[name], dec_hook=lambda kind, text: kind(text))
-                          for name, value in told.items()} | {"config": config})
+                          for name, value in stored.items()} | {"config": config})
 
 
 def command_of(folder: Path) -> str:
-    """The command whose call is kept in a folder, such as "scape mosh"; empty where none is."""
+    """Return the command whose call a folder keeps, such as "scape mosh"; empty text where there is none."""
     path = _file(folder)
     try:
-        told = storage.read_json(path, "a kept call") if path else None
+        stored = storage.read_json(path, "a kept call") if path else None
     except storage.StorageError:
         return ""
-    kind = told.get("kind") if isinstance(told, dict) else None
+    kind = stored.get("kind") if isinstance(stored, dict) else None
     return kind.removeprefix(CALL) if isinstance(kind, str) and kind.startswith(CALL) else ""
 
 
 def _file(folder: Path) -> Path | None:
+    """Return the file with the call in a folder, or None."""
     return next((path for path in (folder / RUN, folder / HOME / RUN) if path.is_file()), None)
 
 
 def _kind(call: KeptCall | type[KeptCall]) -> str:
+    """Return the kind that is written into the file."""
     return CALL + call.command

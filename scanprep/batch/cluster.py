@@ -16,15 +16,20 @@ from ..geometry import storage
 from .digests import paths_of, program, with_paths
 from .room import Failure, Job, attempt_elsewhere
 
-ANSWER = 10                    # seconds that a scheduler may take
+ANSWER = 10                    # seconds to wait for a scheduler: longer means a wrong address
 
 
 def run_on_cluster(address: str, work: Any, jobs: Sequence[Job]) -> Iterator[tuple[Job, Any]]:
-    """Each job with what the work returned, or a Failure, as they finish; ValueError where no scheduler serves.
+    """Run jobs on a Dask cluster and yield each with its result or Failure, in the order in which they finish.
 
-    The work travels to each worker once. Files come back to this process, which alone writes, so workers need no
-    place to write to. One thread a worker is best (`dask worker --nthreads 1 --nworkers auto`). Where a
-    worker does not see the files under the same path, those of each job travel along.
+    The work travels to each worker once. Result files come back to this process, which alone writes to disk.
+    One thread per worker is best (`dask worker --nthreads 1 --nworkers auto`). Where a worker does not see the
+    input files under the same path, they are sent with each job.
+
+    Raises
+    ------
+    ValueError
+        No scheduler answers at the address, it has no workers, or they run other versions.
     """
     from distributed import Client, as_completed
 
@@ -35,49 +40,54 @@ def run_on_cluster(address: str, work: Any, jobs: Sequence[Job]) -> Iterator[tup
                          f"({' '.join(str(error).split())})") from None
     with client:
         try:
-            client.wait_for_workers(1, timeout=60)          # of a cluster that was just started
+            client.wait_for_workers(1, timeout=60)          # seconds: a cluster that was just started needs time
         except TimeoutError:
             raise ValueError(f"workers: {address} has no workers; start some with: dask worker {address}") from None
-        # a task that gives its argument back: unlike scattered data it is made anew where all copies are lost
+        # send the work as a task that returns its argument: scattered data would be lost with the worker that holds it
         shared = client.submit(bytes, pickle.dumps((work, _versions())), pure=False)
-        there = _entrance()
-        ship = not all(_has_same_files(client, job.given) for job in jobs[:1])
+        remote_entry = _entrance()
+        # files travel with the jobs unless every worker sees those of the first job
+        send_files = not all(_has_same_files(client, job.given) for job in jobs[:1])
         waiting = iter(jobs)
         job_of: dict[Any, Job] = {}
         running = as_completed([], loop=client.loop)
 
         def submit() -> None:
-            """The next job; few at a time, so that shipped files do not pile up at the scheduler."""
+            """Submit the next job."""
             for job in waiting:
-                given = with_paths(job.given, Path.absolute)
-                sent = job.name, job.place, given, _files(given) if ship else {}
-                future = client.submit(there, shared, pickle.dumps(sent), pure=False)
+                job_input = with_paths(job.given, Path.absolute)
+                message = job.name, job.place, job_input, _files(job_input) if send_files else {}
+                future = client.submit(remote_entry, shared, pickle.dumps(message), pure=False)
                 job_of[future] = job
                 running.add(future)
                 return
 
+        # two jobs per thread keep workers busy; more would pile up sent files at the scheduler
         for _ in range(2 * sum(client.nthreads().values())):
             submit()
+        # as one job finishes the next one is submitted
         for future in running:
             job = job_of.pop(future)
             submit()
             yield job, _outcome(future, job, address)
 
 
-def _has_same_files(client: Any, given: Any) -> bool:
-    """Whether every worker has the files of a job, by path and size."""
+def _has_same_files(client: Any, job_input: Any) -> bool:
+    """Return whether every worker has the files of a job, judged by path and size."""
     def same(files: list[tuple[str, int]]) -> bool:
         import os
 
         return all(os.path.exists(path) and os.path.getsize(path) == size for path, size in files)
 
-    files = [(str(path.absolute()), path.stat().st_size) for path in paths_of(given) if path.is_file()]
+    files = [(str(path.absolute()), path.stat().st_size) for path in paths_of(job_input) if path.is_file()]
     return all(client.run(same, files).values())
 
 
 def _entrance() -> Callable[[bytes, bytes], tuple[Any, dict[str, bytes], list[str]]]:
-    """What is sent to the workers. Dask sends a function without a name of its own as code, and all else are
-    bytes, so that a scheduler needs nothing of ours."""
+    """Return the function that Dask sends to the workers.
+
+    Dask sends a function without a global name as code. All else are bytes, so the scheduler needs no scapekit.
+    """
     def there(shared: bytes, job: bytes) -> tuple[Any, dict[str, bytes], list[str]]:
         from scanprep.batch.cluster import do_there
 
@@ -87,7 +97,7 @@ def _entrance() -> Callable[[bytes, bytes], tuple[Any, dict[str, bytes], list[st
 
 
 def _outcome(future: Any, job: Job, address: str) -> Any:
-    """What came of a job, its files written to its folder."""
+    """Return the result of a finished job, or a Failure, and write its files into the job's folder."""
     from distributed import KilledWorker
 
     try:
@@ -95,6 +105,7 @@ def _outcome(future: Any, job: Job, address: str) -> Any:
     except CancelledError:
         raise ValueError(f"workers: {address} has gone; what was done is kept, start again to go on") from None
     if error is None:
+        # success: repeat the worker's warnings here and write the files that came back
         value, files, notes = future.result()
         for note in notes:
             warnings.warn(note, stacklevel=2)
@@ -110,42 +121,47 @@ def _outcome(future: Any, job: Job, address: str) -> Any:
 
 
 def do_there(shared: bytes, packed: bytes) -> tuple[Any, dict[str, bytes], list[str]]:
-    """One job on the machine of a worker: what the work returned, the files that it wrote, and our warnings."""
+    """Run one job on the machine of a worker; return its result, the files it wrote, and our warnings."""
     work, versions = pickle.loads(shared)
     if versions != _versions():
         raise RuntimeError(f"the worker has {_describe_versions(_versions())}")
-    name, place, given, sent = pickle.loads(packed)
+    name, place, job_input, file_contents = pickle.loads(packed)
     with tempfile.TemporaryDirectory() as temporary:
         here, paths = Path(temporary), dict[Path, Path]()
-        for i, (path, data) in enumerate(sent.items()):         # names stay, as they tell what is in the files
+        # write the files that came with the job, and point the job to them
+        for i, (path, data) in enumerate(file_contents.items()):         # file names stay: their endings say the format
             paths[path] = here / "sent" / str(i) / path.name
             paths[path].parent.mkdir(parents=True)
             paths[path].write_bytes(data)
-        job = Job(name, with_paths(given, lambda path: paths.get(path, path)), here / "made", place, here / "steps")
+        job = Job(name, with_paths(job_input, lambda path: paths.get(path, path)), here / "made", place, here / "steps")
         outcome, notes = attempt_elsewhere(work, job)
-        for theirs, mine in paths.items():
-            notes = [note.replace(str(mine), str(theirs)) for note in notes]
+        # messages name files as the sender knows them
+        for sender_path, local_path in paths.items():
+            notes = [note.replace(str(local_path), str(sender_path)) for note in notes]
             if isinstance(outcome, Failure):
-                outcome = Failure(outcome.reason.replace(str(mine), str(theirs)))
+                outcome = Failure(outcome.reason.replace(str(local_path), str(sender_path)))
         if isinstance(outcome, Failure):
             return outcome, {}, notes
-        made = {path.relative_to(here / "made").as_posix(): path.read_bytes()
+        # read the results back, as this folder is temporary
+        written_files = {path.relative_to(here / "made").as_posix(): path.read_bytes()
                 for path in sorted((here / "made").rglob("*")) if path.is_file()}
-    return outcome, made, notes
+    return outcome, written_files, notes
 
 
-def _files(given: Any) -> dict[Path, bytes]:
-    """Path -> contents of the files of a job; one that cannot be read is left for the worker to miss."""
-    found: dict[Path, bytes] = {}
-    for path in paths_of(given):
+def _files(job_input: Any) -> dict[Path, bytes]:
+    """Read the files of a job: path -> contents. A file that cannot be read is left for the worker to report."""
+    contents: dict[Path, bytes] = {}
+    for path in paths_of(job_input):
         with contextlib.suppress(OSError):
-            found[path] = path.read_bytes()
-    return found
+            contents[path] = path.read_bytes()
+    return contents
 
 
 def _versions() -> dict[str, str]:
+    """Return the versions that must agree on all machines: results depend on both."""
     return {"scapekit": program(), "numpy": np.__version__}
 
 
 def _describe_versions(versions: dict[str, str]) -> str:
+    """Return versions as words for a message."""
     return " and ".join(f"{name} {version}" for name, version in versions.items())

@@ -1,4 +1,4 @@
-"""Opening an output for one run: no other gets in, foreign files stay, and what a killed run left is put right."""
+"""Opening an output for one run: lock it, protect foreign files, and repair what a killed run left."""
 from __future__ import annotations
 
 import contextlib
@@ -16,15 +16,21 @@ from .workspace import NothingMadeError, Workspace
 
 FileWorkspace = Annotated[Workspace, "steps of a command whose output is a file; they are kept beside it"]
 AnyWorkspace = Annotated[FileWorkspace, "as a FileWorkspace where the output has an ending; else a folder"]
-_open: dict[Path, Workspace] = {}
+_open: dict[Path, Workspace] = {}       # outputs open in this process: a nested call gets the same workspace
 
 
 @contextlib.contextmanager
 def workspace(folder: str | Path, force: bool = False) -> Iterator[Workspace]:
-    """Open an output folder for one run: no other gets in, and what a killed one left is put right.
+    """Open an output folder for one run, lock it, and repair what a killed run left.
 
-    Opened again inside, it is the same one. With `force` nothing counts as done. ValueError where another run is at
-    work, ForeignFileError where files are in it that scapekit did not make.
+    Opened again inside the block, it is the same workspace. With `force` no earlier result counts as done.
+
+    Raises
+    ------
+    ValueError
+        Another run is at work in the folder.
+    ForeignFileError
+        The folder holds files that scapekit did not write.
     """
     folder = Path(folder)
     if (folder / HOME).absolute() in _open:
@@ -32,6 +38,7 @@ def workspace(folder: str | Path, force: bool = False) -> Iterator[Workspace]:
         return
     if folder.exists() and not folder.is_dir():
         raise ForeignFileError(f"{folder}: expected a folder for the output, found a file")
+    # a folder without our records must be empty, or it belongs to somebody else
     if not (folder / HOME).is_dir():
         refuse_any(folder)
     with _lock_and_recover(Workspace(folder, folder / HOME, force)) as space:
@@ -40,13 +47,13 @@ def workspace(folder: str | Path, force: bool = False) -> Iterator[Workspace]:
 
 @contextlib.contextmanager
 def beside(output: str | Path, force: bool = False) -> Iterator[Workspace]:
-    """Open an output that is a file, or a folder that is made at once: what is kept meanwhile lies beside it.
+    """Open an output that is a file, or a folder written in one go; intermediate results lie beside it.
 
-    At the end that is removed; what was written is told by the report beside the output. Errors as `workspace`.
+    They are removed at the end. What was written is recorded in the report beside the output. Errors as `workspace`.
     """
     output = Path(output)
     space = Workspace(output.parent, output.parent / f".{output.name}{HOME}", force, output)
-    with _lock_and_recover(space):                # first what a killed run had finished comes to its place, and is ours
+    with _lock_and_recover(space):                # first, so that files finished by a killed run count as ours
         if output.is_dir() and not (output / HOME).is_dir() and not digests_in_report(output):
             refuse_any(output)
         if output.is_file() and not space.is_ours(output.name):
@@ -56,14 +63,15 @@ def beside(output: str | Path, force: bool = False) -> Iterator[Workspace]:
 
 @contextlib.contextmanager
 def _lock_and_recover(space: Workspace) -> Iterator[Workspace]:
-    """Locked, and put right where an earlier run was killed; of one that came to nothing, nothing is left."""
+    """Lock a workspace, repair it, and on leaving remove what need not stay."""
     key, made = space.home.absolute(), [p for p in (space.home, *space.home.parents) if not p.exists()]
     for place in (space.home, *(Path(parent) / name for parent, folders, files in os.walk(space.home)
                                 for name in (*folders, *files))):
-        if place.is_symlink():                              # what is moved and removed there would be elsewhere
+        if place.is_symlink():                              # through a link, files elsewhere would be moved or removed
             raise ForeignFileError(f"{place}: expected a file or folder that scapekit made, found a link; remove it")
     space.home.mkdir(parents=True, exist_ok=True)
     space.is_new = space.folder in made
+    # while the lock is held: repair, run the caller's block, clean up
     with lock_output(space.home / "lock", space.output or space.folder):
         space._recover()
         _open[key] = space
@@ -76,26 +84,33 @@ def _lock_and_recover(space: Workspace) -> Iterator[Workspace]:
             del _open[key]
             shutil.rmtree(space.home / "making", ignore_errors=True)
             if space.output is not None:
-                space.drop_record("output")                 # the report tells what was written
-            if any(space.home.glob("[drs]*/*")):            # done, ready, steps
+                space.drop_record("output")                 # the report keeps this record
+            if any(space.home.glob("[drs]*/*")):            # any results in the folders done, ready and steps?
                 space.digests.save()
             else:
+                # nothing was kept: remove the folders that this run made
                 shutil.rmtree(space.home)
-                with contextlib.suppress(OSError):          # others have put something there
+                with contextlib.suppress(OSError):          # somebody else has put files there
                     for folder in made[1:]:
                         folder.rmdir()
 
 
 @contextlib.contextmanager
 def lock_output(path: Path, output: Path, wait: bool = False) -> Iterator[None]:
-    """Keep other runs out of an output until the block ends: ValueError, or wait for them.
+    """Keep other runs out of an output until the block ends.
 
-    The operating system holds the lock, so that a run that was killed leaves none behind. `output` is for the message.
+    The operating system holds the lock, so a killed run leaves none behind. `output` is for the message.
+
+    Raises
+    ------
+    ValueError
+        Another run holds the lock, unless `wait`.
     """
     while True:
         with open(path, "a+", encoding="utf-8") as file:
             if not _take(file):
                 if wait:
+                    # seconds between two attempts: short for the user, no load for the machine
                     time.sleep(0.2)
                     continue
                 file.seek(0)
@@ -103,27 +118,28 @@ def lock_output(path: Path, output: Path, wait: bool = False) -> Iterator[None]:
                                  "wait for it, or name another output")
             try:
                 if os.fstat(file.fileno()).st_ino != path.stat().st_ino:
-                    continue            # the run before removed it between our opening and our taking it
+                    continue            # the run before removed the file after we opened it: try again
             except OSError:
                 continue
+            # write who holds the lock, for the message to others
             file.truncate(0)
             file.write(f"process {os.getpid()} on {platform.node()}, since {time.strftime('%Y-%m-%d %H:%M:%S')}\n")
             file.flush()
             try:
                 yield
             finally:
-                with contextlib.suppress(OSError):      # where open files cannot be removed it stays, unlocked
+                with contextlib.suppress(OSError):      # Windows cannot remove an open file: it stays, unlocked
                     path.unlink()
             return
 
 
 def _take(file: IO[str]) -> bool:
-    """Whether the lock of an open file could be had at once."""
+    """Try to lock an open file; return whether it worked."""
     try:
         if sys.platform == "win32":
             import msvcrt
 
-            file.seek(1 << 20)          # a place nobody reads: others may still read who holds the lock
+            file.seek(1 << 20)          # lock one byte far behind the text, so that others can read who holds the lock
             msvcrt.locking(file.fileno(), msvcrt.LK_NBLCK, 1)
         else:
             import fcntl

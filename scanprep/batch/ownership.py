@@ -1,4 +1,4 @@
-"""What in an output is scapekit's own, and what is not and is left alone."""
+"""Which files of an output scapekit wrote itself, and which are foreign and must not be touched."""
 from __future__ import annotations
 
 from collections.abc import Mapping
@@ -7,54 +7,56 @@ from pathlib import Path
 from ..geometry import storage
 from .digests import Digests
 
-HOME = ".scapekit"
+HOME = ".scapekit"              # folder with our records, hidden so that it does not mix with results
 
 
 class ForeignFileError(ValueError):
-    """Something stands where an output should go, and scapekit did not write it."""
+    """A file stands where the output should go, and scapekit did not write it."""
 
 
 def add_written(known: dict[str, set[str]], files: Mapping[str, str], place: Path) -> None:
-    """Add files, from a place in the output on, with the digests that they were written with."""
+    """Add files, with paths from `place` on, and the digests that they were written with."""
     for file, digest in files.items():
         known.setdefault((place / file).as_posix(), set()).add(digest)
 
 
 def report_path(output: Path) -> Path:
-    """Where the report of an output stands: in a folder; beside a file, as `walk.glb.report.json`.
+    """Return where the report of an output is: inside a folder, or beside a file, as `walk.glb.report.json`.
 
-    With the whole name: files that differ in their endings only, `walk.glb` and `walk.bvh`, keep a report each.
+    The whole file name is used, so that `walk.glb` and `walk.bvh` have separate reports.
     """
     return output / "report.json" if output.is_dir() else output.with_name(f"{output.name}.report.json")
 
 
 def digests_in_report(output: Path) -> dict[str, str]:
-    """File -> digest of all that a command wrote for an output, as its report tells; nothing where there is none.
+    """Return file -> digest of everything a command wrote for an output, as its report says; empty without report.
 
-    Paths are from the folder of the report on. Reports of files were once named without the ending, and count too.
+    Paths start at the folder of the report. Older reports were named without the file ending; they count too.
     """
-    earlier = [] if output.is_dir() else [output.with_suffix(".report.json")]
-    for report in (report_path(output), *earlier):
+    older_names = [] if output.is_dir() else [output.with_suffix(".report.json")]
+    for report in (report_path(output), *older_names):
         try:
             with storage.taking_apart(report, "a report"):
-                told = storage.read_json(report, "a report")["written"]
+                written = storage.read_json(report, "a report")["written"]
         except storage.StorageError:
             continue
-        if isinstance(told, dict) and (report not in earlier or output.name in told):
-            for file in told:
+        # an older report name may belong to another output: it must list this file
+        if isinstance(written, dict) and (report not in older_names or output.name in written):
+            for file in written:
                 storage.path_inside(report.parent, file, report)
-            return {**told, report.name: Digests().of_file(report)}
+            return {**written, report.name: Digests().of_file(report)}
     return {}
 
 
 def refuse_any(folder: Path) -> None:
-    """Refuse a folder that holds anything but hidden files."""
+    """Raise ForeignFileError for a folder that holds anything but hidden files."""
     inside = sorted(path for path in folder.iterdir() if not path.name.startswith(".")) if folder.is_dir() else []
     if inside:
         raise ForeignFileError(refusal(*inside))
 
 
 def refusal(*taken: Path) -> str:
+    """Return the message about files in the way of an output: three by name, the rest as a number."""
     more = f" and {len(taken) - 3} more" if len(taken) > 3 else ""
     return (f"{', '.join(str(path) for path in taken[:3])}{more}: in the way of the output, and not as scapekit "
             "wrote it; nothing was touched: name another output, or move it away")

@@ -1,4 +1,4 @@
-"""Tasks side by side: in this process, in processes of this machine, or on a Dask cluster."""
+"""Tasks in parallel: in this process, in processes of this machine, or on a Dask cluster."""
 from __future__ import annotations
 
 import os
@@ -19,7 +19,7 @@ R = TypeVar("R")
 
 @dataclass(frozen=True)
 class Workers(Settings):
-    """Who does the work.
+    """Where the work is done.
 
     Attributes
     ----------
@@ -33,7 +33,7 @@ class Workers(Settings):
 
 def run_jobs(work: Any, jobs: Sequence[Job], workers: Workers, inside: Progress | None = None
              ) -> Iterator[tuple[Job, Any]]:
-    """Each job with what the work returned, or a Failure, as they finish."""
+    """Run jobs and yield each with its result or Failure, in the order in which they finish."""
     if not jobs:
         return iter(())
     if isinstance(workers.workers, str):
@@ -47,15 +47,19 @@ def run_jobs(work: Any, jobs: Sequence[Job], workers: Workers, inside: Progress 
 
 
 def _run_in_processes(work: Any, jobs: Sequence[Job], count: int) -> Iterator[tuple[Job, Any]]:
-    """A process that dies, say for want of memory, stops no other job: those under way are tried again one at a
-    time, so that the guilty one is known."""
+    """Run jobs in several processes of this machine.
+
+    When a process dies, for example for lack of memory, its job and those beside it are tried again one at a time.
+    So the job that killed it is known, and no other job is lost.
+    """
     from loky import ProcessPoolExecutor, as_completed
     from loky.process_executor import BrokenProcessPool
 
-    left = list(jobs)
+    remaining = list(jobs)
+    # first all jobs at once; after a crash those that remain, one by one
     for at_once in (len(jobs), 1):
-        while left:
-            group = left[:at_once]
+        while remaining:
+            group = remaining[:at_once]
             pool = ProcessPoolExecutor(min(count, len(group)), initializer=_begin, initargs=(work, os.getpid()))
             try:
                 job_of = {pool.submit(_do, job): job for job in group}
@@ -63,12 +67,13 @@ def _run_in_processes(work: Any, jobs: Sequence[Job], count: int) -> Iterator[tu
                     outcome, notes = future.result()
                     for note in notes:
                         warnings.warn(note, stacklevel=2)
-                    left.remove(job_of[future])
+                    remaining.remove(job_of[future])
                     yield job_of[future], outcome
             except BrokenProcessPool as error:
+                # several were at work: which one is guilty shows in the second round
                 if at_once > 1:
                     break
-                left.remove(group[0])
+                remaining.remove(group[0])
                 why = " ".join(str(error).split())
                 yield group[0], Failure(f"{group[0].name}: the process at work on it died: {why}")
             finally:
@@ -76,15 +81,15 @@ def _run_in_processes(work: Any, jobs: Sequence[Job], count: int) -> Iterator[tu
 
 
 class SideBySide(Generic[T, R]):
-    """What a function makes of items that are asked for one after the other, worked out in processes ahead of that.
+    """Results of a function for items asked for in order, computed ahead in other processes.
 
-    The first is done in this process. The others are too where that takes less than it would to start processes and to
-    fetch the results, where there is one core, and where a process dies, say for want of memory. The results are the
-    same. A context manager: leaving it ends the processes.
+    The first item is computed in this process. So are the others when starting processes would take longer, on a
+    machine with one core, and after a process has died. The results are the same. Use it as a context manager:
+    leaving the block ends the processes.
     """
 
-    WORTH = 10.0                    # seconds of work left for which processes are started
-    AT_MOST = 4                     # processes: each holds what the function needs, and what it makes
+    WORTH = 10.0                    # seconds of remaining work that repay the start of processes
+    AT_MOST = 4                     # processes: each needs memory for the function's data and results
 
     def __init__(self, function: Callable[[T], R], items: Sequence[T]) -> None:
         self._function, self._items = function, items
@@ -101,22 +106,25 @@ class SideBySide(Generic[T, R]):
         self._pool, self._futures = None, {}
 
     def __call__(self, number: int) -> R:
-        """The result of one item; a few that come after it are begun."""
+        """Return the result of one item, and start on the items that follow."""
         if self._pool is None:
             return self._here(number)
         from loky.process_executor import BrokenProcessPool
 
         try:
+            # two items per process are under way: enough to keep all busy, little to hold in memory
             for ahead in range(number, min(number + 2 * self._helpers, len(self._items))):
                 if ahead not in self._futures:
                     self._futures[ahead] = self._pool.submit(_call, self._items[ahead])
             return cast(R, self._futures.pop(number).result())
         except BrokenProcessPool:
+            # a process died: go on without any
             self.__exit__()
             self._helpers = 0
             return self._here(number)
 
     def _here(self, number: int) -> R:
+        """Compute an item in this process, and start processes if enough work remains."""
         begun = time.perf_counter()
         result = self._function(self._items[number])
         left = (time.perf_counter() - begun) * (len(self._items) - number - 1)
@@ -127,11 +135,11 @@ class SideBySide(Generic[T, R]):
         return result
 
 
-_work: Any = None
+_work: Any = None               # in a worker process: what all its jobs have in common
 
 
 def _begin(work: Any, parent: int) -> None:
-    """A worker keeps what all jobs have in common, says nothing, and goes when the process that wants it goes."""
+    """Prepare a worker process: keep the common work, silence warnings, and end with the parent process."""
     global _work
     _work = work
     begin_worker()
@@ -140,14 +148,18 @@ def _begin(work: Any, parent: int) -> None:
 
 
 def _watch(parent: int) -> None:
+    """End this process when its parent has ended."""
+    # an orphan gets another parent; checked five times a second, which costs nothing
     while os.getppid() == parent:
         time.sleep(0.2)
     os.kill(os.getpid(), 9)
 
 
 def _do(job: Job) -> tuple[Any, list[str]]:
+    """Run a job in a worker process."""
     return attempt_elsewhere(_work, job)
 
 
 def _call(item: Any) -> Any:
+    """Apply the function of `SideBySide` in a worker process."""
     return _work(item)

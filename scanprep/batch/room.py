@@ -1,4 +1,4 @@
-"""Where one task is worked on: its files, its steps, and what became of it; and steps that need not be kept."""
+"""The context in which one task runs: its files, its steps, its outcome; and steps that are not kept."""
 from __future__ import annotations
 
 import contextlib
@@ -27,23 +27,23 @@ class Job:
 
     name: str
     given: Any
-    folder: Path                    # where it is made; its files are in `folder / place`
+    folder: Path                    # temporary folder; the files are in `folder / place`
     place: str = ""
-    steps: Path | None = None       # where its steps are kept
-    force: bool = False             # take no step as done
+    steps: Path | None = None       # folder in which the results of steps are kept
+    force: bool = False             # compute every step again
 
 
 @dataclass(frozen=True)
 class Failure:
-    """Why a task failed, in one line that names the file."""
+    """Why a task failed: one line that names the file."""
 
     reason: str
 
 
 class TaskContext:
-    """Where one task is worked on.
+    """What a task gets to work with.
 
-    `folder` takes its files, `step` keeps results that are found again when the task was interrupted,
+    `folder` is for its files. `step` keeps intermediate results, which an interrupted task finds again.
     `tell(done, total)` reports progress. With `force` no step of an earlier run counts as done.
     """
 
@@ -53,7 +53,7 @@ class TaskContext:
         self._digests, self._force, self._made = Digests(), force, set[str]()
 
     def step(self, name: str, inputs: Any, make: Callable[[], T]) -> T:
-        """What `make` returns, or returned when it was last called with the same inputs."""
+        """Return what `make` returns, or what it returned before for the same inputs."""
         if self._steps is None:
             return make()
         path, key = self._step_file(name), self._digests.key(inputs)
@@ -62,53 +62,58 @@ class TaskContext:
                 return load_value(path)
         save_value(path, make(), {"digest": key})
         self._made.add(name)
-        return load_value(path)          # arrays as they are stored: their order in memory tells in the last digits
+        return load_value(path)          # read back: the memory order of arrays changes the last digits of sums
 
     def files(self, name: str, inputs: Any, make: Callable[[Path], T]) -> T:
-        """As `step`; `make` gets a folder, and what it writes there comes into `self.folder`."""
+        """Run a step that also writes files: `make` gets a folder, whose files come into `self.folder`."""
         if self._steps is None:
             return make(self.folder)
         kept = self._step_file(name).with_suffix(".files")
 
-        def made() -> tuple[T, dict[str, str]]:
+        def run_make() -> tuple[T, dict[str, str]]:
+            """Run `make` in an empty folder; return its result and the digests of its files."""
             shutil.rmtree(kept, ignore_errors=True)
             kept.mkdir(parents=True)
             return make(kept), self._digests.of_files(kept)
 
-        value, files = self.step(name, inputs, made)
-        if self._digests.of_files(kept) != files:        # other ones than those of the step
+        value, files = self.step(name, inputs, run_make)
+        if self._digests.of_files(kept) != files:        # somebody changed the kept files: make them again
             self._step_file(name).unlink()
-            value, files = self.step(name, inputs, made)
+            value, files = self.step(name, inputs, run_make)
+        # hard links cost neither time nor space; some file systems need a copy
         for file in files:
             (self.folder / file).parent.mkdir(parents=True, exist_ok=True)
             try:
                 os.link(kept / file, self.folder / file)
-            except OSError:                              # where that cannot be
+            except OSError:
                 shutil.copyfile(kept / file, self.folder / file)
         return value
 
     def _step_file(self, name: str) -> Path:
+        """Return the file of a step; its name may hold any character."""
         assert self._steps is not None, "steps are kept"
         return self._steps / f"{quote(name, safe=' ')}.npz"
 
 
-def attempt(work: Any, job: Job, tell: Progress | None = None) -> Any:
-    """What the work returns, or a Failure; an error in our code stops no other task."""
+def attempt(work: Any, job: Job, report_progress: Progress | None = None) -> Any:
+    """Run a job; return its result, or a Failure, so that an error stops no other task."""
     folder = job.folder / job.place
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        with one_thread():              # so that bytes do not depend on where it is done
-            return work(job.given, TaskContext(folder, job.steps, tell, job.force))
+        with one_thread():              # results are the same to the last digit wherever it runs
+            return work(job.given, TaskContext(folder, job.steps, report_progress, job.force))
     except Exception as error:
         text = " ".join(str(error).split())
+        # an unexpected kind of error is named, for whoever reports it
         if not isinstance(error, ValueError | OSError | ModuleNotFoundError):
             text = f"{type(error).__name__}: {text}"
+        # every failure names a file of the task
         files = [str(path) for path in paths_of(job.given)] or [job.name]
         return Failure(text if any(file in text for file in files) else f"{files[0]}: {text}")
 
 
 def attempt_elsewhere(work: Any, job: Job) -> tuple[Any, list[str]]:
-    """The same on behalf of another process: with our warnings, for that one to tell."""
+    """Run a job for another process; return its outcome and our warnings, which that process shows."""
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("ignore")
         warnings.filterwarnings("always", category=UserWarning, module=OUR_MODULES)
@@ -117,18 +122,18 @@ def attempt_elsewhere(work: Any, job: Job) -> tuple[Any, list[str]]:
 
 
 class Step(Protocol):
-    """A result that is made once for the same inputs: `TaskContext.step`, or `KeptSteps`."""
+    """A result computed once for the same inputs: `TaskContext.step`, or `KeptSteps`."""
 
     def __call__(self, name: str, inputs: Any, make: Callable[[], T]) -> T: ...
 
 
 def run_uncached(name: str, inputs: Any, make: Callable[[], T]) -> T:
-    """A step that is not kept."""
+    """Run a step without keeping its result."""
     return make()
 
 
 def substeps(step: Step, outer: str) -> Step:
-    """Steps of which a larger one consists."""
+    """Return a step function whose names begin with that of the larger step."""
     def inner(name: str, inputs: Any, make: Callable[[], T]) -> T:
         return step(f"{outer}/{name}", inputs, make)
 

@@ -1,13 +1,13 @@
-"""An output and what scapekit knows of it: what it wrote there, what is whole, and what must be done anew.
+"""An output folder and the records of it: what was written, what is complete, and what must be computed again.
 
     OUTPUT/.scapekit/lock           held while a run is at work
-                     making/        what is being made; a killed run's is removed at the next start
-                     ready/NAME/    whole, on its way to its place; a killed run's is brought there at the next start
-                     done/NAME.npz  a result: digest of what it depends on, digests of its files, its value
-                     steps/         results that later ones are made of
-                     files.json     digests of files by size and times of change
+                     making/        unfinished results; those of a killed run are removed at the next start
+                     ready/NAME/    finished results on the way to their place; moved there at the next start
+                     done/NAME.npz  record of a result: digest of its inputs, digests of its files, its value
+                     steps/         intermediate results
+                     files.json     digests of files by size and modification time
 
-A file is replaced or removed only when it is as scapekit wrote it.
+A file is replaced or removed only when it is unchanged since scapekit wrote it.
 """
 from __future__ import annotations
 
@@ -29,38 +29,38 @@ from .ownership import HOME, ForeignFileError, add_written, digests_in_report, r
 from .pool import Failure, Job, Progress, Workers, run_jobs
 from .values import load_step_header, load_value, save_value
 
-RECORD = ".record.npz"
-NOTHING: Any = object()                   # no result; None may be one
+RECORD = ".record.npz"                    # hidden, as it lies among the files of the result until all are moved
+NOTHING: Any = object()                   # stands for no result, because None can be a result
 T = TypeVar("T")
 
 
 @dataclass(frozen=True)
 class Task:
-    """One thing of many, worked on once."""
+    """One piece of work among many, done once."""
 
-    name: str               # its own in the output
-    given: Any              # frozen dataclass that is worked on; Paths in it count as what the files hold
-    place: str = ""         # folder of its files inside the output
+    name: str               # unique in the output
+    given: Any              # input, a frozen dataclass; a Path in it counts as the file's contents
+    place: str = ""         # folder for its files inside the output
 
 
 @dataclass(frozen=True)
 class Results:
-    """What became of tasks, by their names."""
+    """Outcomes of tasks by name."""
 
-    values: dict[str, Any]          # what the work returned, in the order of the tasks
-    failures: dict[str, str]        # one line each
-    fresh: tuple[str, ...]          # those that were done now; the others had been done before
+    values: dict[str, Any]          # results, in the order of the tasks
+    failures: dict[str, str]        # one line per failed task
+    fresh: tuple[str, ...]          # computed in this run; the others were kept from before
 
     @property
     def only(self) -> Any:
-        """The value of the only task; ValueError where it failed."""
+        """Return the value of the only task; ValueError where it failed."""
         if self.failures:
             raise ValueError(*self.failures.values())
         return next(iter(self.values.values()))
 
 
 class NothingMadeError(ValueError):
-    """All the tasks of a run failed: of an output that it made itself nothing stays."""
+    """All tasks of a run failed: an output that this run created is removed again."""
 
     def __init__(self, failures: Sequence[str]) -> None:
         super().__init__("all failed; nothing was written")
@@ -73,61 +73,78 @@ class Workspace:
     def __init__(self, folder: Path, home: Path, force: bool = False, output: Path | None = None) -> None:
         self.folder, self.home, self.force, self.output = folder, home, force, output
         self.digests = Digests(home / "files.json")
-        self.is_new = False                 # this run made the folder
-        self.all_failed = False             # there were tasks, and of all that were run none was done
+        self.is_new = False                 # this run created the folder
+        self.all_failed = False             # there were tasks, and every one of them failed
         self._some_done = False
         self._made: set[str] = set()
 
     @cached_property
     def _written(self) -> dict[str, set[str]]:
-        """File of the output -> digests that it was written with."""
-        found: dict[str, set[str]] = {}
+        """Return file of the output -> digests that scapekit wrote it with."""
+        known: dict[str, set[str]] = {}
         for place in {self.folder, self.output or self.folder}:
             for record in (place / HOME / "done").glob("*.npz"):
-                add_written(found, _files_of(record, place), place.relative_to(self.folder))
+                add_written(known, _files_of(record, place), place.relative_to(self.folder))
         if self.output is not None:
-            add_written(found, digests_in_report(self.output), report_path(self.output).parent.relative_to(self.folder))
-        return found
+            add_written(known, digests_in_report(self.output), report_path(self.output).parent.relative_to(self.folder))
+        return known
 
     def run(self, work: Any, tasks: Sequence[Task], workers: Workers | None = None, progress: Progress | None = None,
             inside: Progress | None = None) -> Results:
-        """Every task whose result is not there, or depends on something that has changed since.
+        """Run every task whose result is missing, or whose inputs have changed since.
 
-        A task that fails stops no other. Files and value of each take their place when they are whole. `work`, a frozen
-        dataclass, is what tasks have in common and sent to every worker once: called with (given, room), it writes
-        files into `room.folder` and returns a value that can be kept. `progress` counts tasks, `inside` is `room.tell`
-        of those that are done in this process.
+        A failed task stops no other. Files and value of a task take their place together when both are complete.
+
+        Parameters
+        ----------
+        work : callable, frozen dataclass
+            What the tasks have in common, sent to every worker once. Called as work(given, context), it writes
+            files into `context.folder` and returns a value that can be stored.
+        tasks : sequence of Task
+            Tasks with different names.
+        workers : Workers, optional
+            Where the tasks run.
+        progress : callable, optional
+            Called as progress(done, total) with the number of tasks.
+        inside : callable, optional
+            The same for the steps inside tasks that run in this process.
+
+        Returns
+        -------
+        Results
         """
-        tell = progress or (lambda done, total: None)
+        report_progress = progress or (lambda done, total: None)
         common = self.digests.of(work)
         keys = {task.name: self._key(common, task) for task in tasks}
         assert len(keys) == len(tasks), "names of tasks differ"
-        # what is kept, what has no place to write to, and the jobs that are left
+        # look up kept results, find tasks whose place is taken, and make jobs of the rest
         outcomes: dict[str, Any] = {name: self._load_if_valid(name, key) for name, key in keys.items()}
-        wanted = [task for task in tasks if outcomes[task.name] is NOTHING]
-        outcomes |= {task.name: Failure(line) for task in wanted if (line := self._why_blocked(task))}
+        pending = [task for task in tasks if outcomes[task.name] is NOTHING]
+        outcomes |= {task.name: Failure(line) for task in pending if (line := self._why_blocked(task))}
         jobs = [Job(task.name, task.given, self._making(), task.place, self.home / "steps" / _plain(task.name),
-                    self.force) for task in wanted if outcomes[task.name] is NOTHING]
+                    self.force) for task in pending if outcomes[task.name] is NOTHING]
         done = len(tasks) - len(jobs)
-        tell(done, len(tasks))
+        report_progress(done, len(tasks))
         try:
+            # run the jobs, and accept each result as it comes
             for job, outcome in run_jobs(work, jobs, workers or Workers(), inside):
                 outcomes[job.name] = self._accept(job, outcome, keys[job.name], common)
                 done += 1
-                tell(done, len(tasks))
+                report_progress(done, len(tasks))
         finally:
             for job in jobs:
                 shutil.rmtree(job.folder, ignore_errors=True)
-        failures = {name: one.reason for name, one in outcomes.items() if isinstance(one, Failure)}
+        # sort the outcomes into values and failures
+        failures = {name: outcome.reason for name, outcome in outcomes.items() if isinstance(outcome, Failure)}
         self._some_done |= len(failures) < len(tasks)
         self.all_failed = not self._some_done and (self.all_failed or bool(tasks))
         return Results({name: value for name, value in outcomes.items() if name not in failures}, failures,
                        tuple(job.name for job in jobs if job.name not in failures))
 
     def _accept(self, job: Job, outcome: Any, key: str, work: str) -> Any:
-        """The value of a job as it is kept, its files in their place; or a Failure, which tells of that place."""
+        """Publish the outcome of a job; return its value as stored, or a Failure that names the final place."""
         if isinstance(outcome, Failure):
-            self.drop(job.name)                     # what was made of other inputs than there are now
+            self.drop(job.name)                     # a result of earlier inputs is no longer true
             return Failure(outcome.reason.replace(str(job.folder / job.place), str(self.folder / job.place)))
         try:
             self._publish(job.name, job.folder, key, outcome, work)
@@ -136,7 +153,7 @@ class Workspace:
         return self.value(job.name)
 
     def step(self, name: str, inputs: Any, make: Callable[[Path], T]) -> T:
-        """What `make` returns, or returned for the same inputs before; it gets a folder for files of the output."""
+        """Return what `make` returns, or returned before for the same inputs; it gets a folder for output files."""
         key = self.digests.key(inputs)
         kept = self._load_if_valid(name, key)
         if kept is not NOTHING:
@@ -146,12 +163,12 @@ class Workspace:
         return self.value(name)
 
     def is_done(self, work: Any, task: Task) -> bool:
-        """Whether `run` would leave a task as it is."""
+        """Return whether `run` would keep the existing result of a task."""
         return self._load_if_valid(task.name, self._key(self.digests.of(work), task)) is not NOTHING
 
     @contextlib.contextmanager
     def instead(self, work: Any, task: Task) -> Iterator[Staged]:
-        """As `staging`, of a task that somebody does in another way: for `run` it is done."""
+        """Stage a result that replaces the one of a task; afterwards `run` takes the task as done."""
         if line := self._why_blocked(task):
             raise ForeignFileError(line)
         common = self.digests.of(work)
@@ -160,7 +177,7 @@ class Workspace:
 
     @contextlib.contextmanager
     def staging(self, name: str, key: str = "", work: str = "") -> Iterator[Staged]:
-        """A folder for files that take their place in the output, all of them, when the block ends well."""
+        """Provide a temporary folder; its files move into the output together when the block ends without error."""
         staged = Staged(self._making())
         try:
             yield staged
@@ -169,50 +186,50 @@ class Workspace:
             shutil.rmtree(staged.folder, ignore_errors=True)
 
     def drop(self, name: str) -> None:
-        """Remove a result and its files, as far as they are as scapekit wrote them."""
+        """Remove a result and those of its files that are unchanged."""
         for file, digest in _files_of(self._record(name), self.folder).items():
             self._remove(file, digest)
         self.drop_record(name)
 
     def drop_record(self, name: str) -> None:
-        """Remove what is kept of a result, but none of its files."""
+        """Remove the record of a result, but none of its files."""
         self._record(name).unlink(missing_ok=True)
 
     def list_results(self, start: str) -> list[str]:
-        """The results that are kept and whose names begin so."""
+        """Return the names of kept results that begin with a text."""
         return [unquote(path.stem) for path in sorted((self.home / "done").glob(f"{_plain(start)}*.npz"))]
 
     def drop_others(self, start: str, names: Collection[str] = ()) -> None:
-        """Remove the results whose names begin so, but for those named."""
+        """Remove the results whose names begin with a text, except the named ones."""
         for name in self.list_results(start):
             if name not in names:
                 self.drop(name)
 
     def results(self, work: Any) -> dict[str, Any]:
-        """What is kept of some work, whichever program made it, by name: whole, with all its files."""
+        """Return name -> value of all complete results of some work, whichever program version made them."""
         common = self.digests.of(work)
-        found = {}
+        values = {}
         for path in sorted((self.home / "done").glob("*.npz")):
             header = _read_record(path, self.folder)
             if header and header["work"] == common and all((self.folder / f).is_file() for f in header["files"]):
-                with contextlib.suppress(storage.StorageError):         # damaged, or of a program with other values
-                    found[unquote(path.stem)] = load_value(path)
-        return found
+                with contextlib.suppress(storage.StorageError):         # damaged, or of a version with other fields
+                    values[unquote(path.stem)] = load_value(path)
+        return values
 
     def is_ours(self, file: str) -> bool:
-        """Whether a file of the output is as scapekit wrote it, and has not been changed since."""
+        """Return whether a file of the output is unchanged since scapekit wrote it."""
         return self.digests.of_file(self.folder / file) in self._written.get(file, ())
 
     def value(self, name: str) -> Any:
-        """A result as it is kept: how arrays lie in memory decides the last digits of sums."""
+        """Read a result back from its file: the memory order of arrays changes the last digits of sums."""
         return load_value(self._record(name))
 
     def _key(self, common: str, task: Task) -> str:
-        """What a task depends on; `common` is the digest of the work."""
+        """Compute the digest of everything a task depends on; `common` is the digest of the work."""
         return self.digests.key(common, task.place, task.given)
 
     def _load_if_valid(self, name: str, key: str) -> Any:
-        """A result made from the same inputs whose files are all there; NOTHING where it must be made anew."""
+        """Read a result made from the same inputs whose files all exist; else return NOTHING."""
         header = _read_record(self._record(name), self.folder)
         if header is None or header["digest"] != key or (self.force and name not in self._made) \
                 or not all((self.folder / file).is_file() for file in header["files"]):
@@ -223,8 +240,9 @@ class Workspace:
             return NOTHING
 
     def _why_blocked(self, task: Task) -> str:
-        """Why a task has no place to write to, before any work is done for it."""
+        """Return why a task cannot write to its place, before any work is done; empty text if it can."""
         place = self.folder / task.place
+        # no folder of its own, nothing there yet, or an earlier result of this task
         if not task.place or not place.exists() or self._record(task.name).exists():
             return ""
         if place.is_dir() and not any(place.iterdir()):
@@ -232,22 +250,28 @@ class Workspace:
         return refusal(place)
 
     def _making(self) -> Path:
+        """Create a temporary folder for a result."""
         (self.home / "making").mkdir(exist_ok=True)
         return Path(tempfile.mkdtemp(dir=self.home / "making"))
 
     def _record(self, name: str) -> Path:
+        """Return the file that records a result."""
         return self.home / "done" / f"{_plain(name)}.npz"
 
     def _publish(self, name: str, staged: Path, key: str, value: Any, work: str = "") -> None:
-        """Whole from the moment at which the folder gets its name among the ready ones."""
-        files, taken = self.digests.of_files(staged), list[Path]()
+        """Move a finished result into the output, or raise ForeignFileError if foreign files are in the way.
+
+        The result counts as complete from the moment its folder is renamed into `ready`.
+        """
+        files, blocked = self.digests.of_files(staged), list[Path]()
         for file, digest in files.items():
-            place = storage.path_inside(self.folder, file, self.folder)      # no link leads the file elsewhere
+            place = storage.path_inside(self.folder, file, self.folder)      # refuses links that lead out of the output
             if place.is_dir() or any(p.is_file() for p in place.parents if self.folder in p.parents) \
                     or (place.exists() and self.digests.of_file(place) != digest and not self.is_ours(file)):
-                taken.append(place)
-        if taken:
-            raise ForeignFileError(refusal(*taken))
+                blocked.append(place)
+        if blocked:
+            raise ForeignFileError(refusal(*blocked))
+        # one rename makes the result complete; a run killed after it is repaired at the next start
         save_value(staged / RECORD, value, {"digest": key, "work": work, "files": files})
         ready = self.home / "ready" / _plain(name)
         ready.parent.mkdir(exist_ok=True)
@@ -256,27 +280,34 @@ class Workspace:
         self._made.add(name)
 
     def _settle(self, ready: Path) -> None:
-        """Bring the files of a result to their place, and take away those that it had before and has no more."""
+        """Move the files of a complete result to their place, and remove files that only the former result had."""
         header = _read_record(ready / RECORD, self.folder)
-        if header is None:                                  # results get their name when they are whole
+        if header is None:                                  # a folder in `ready` always has its record
             raise storage.StorageError(f"{ready / RECORD}: expected the record of a result, cannot read it; remove "
                                        f"the folder {ready} to make that result anew")
         record = self._record(unquote(ready.name))
-        before = self._before(unquote(ready.name))
+        former_files = _files_of(record, self.folder)
+        if not former_files and self.output is not None and unquote(ready.name) == "output":
+            # an output that is a single file keeps its former files in its report
+            place = report_path(self.output).parent.relative_to(self.folder)
+            former_files = {(place / file).as_posix(): digest for file, digest in
+                            digests_in_report(self.output).items()}
+        # move the new files, then remove those that only the former result had
         for file in header["files"]:
-            if (ready / file).exists():                     # else it was brought before the run was killed
+            if (ready / file).exists():                     # otherwise it was moved before the run was killed
                 (self.folder / file).parent.mkdir(parents=True, exist_ok=True)
                 os.replace(ready / file, self.folder / file)
-        for file, digest in before.items():
+        for file, digest in former_files.items():
             if file not in header["files"]:
                 self._remove(file, digest)
+        # the record moves last: until then the next start repeats what is missing
         add_written(self._written, header["files"], Path())
         record.parent.mkdir(exist_ok=True)
         os.replace(ready / RECORD, record)
         shutil.rmtree(ready)
 
     def _remove(self, file: str, digest: str) -> None:
-        """Take away a file that is as it was written, and the folders that are empty then."""
+        """Remove a file if it is unchanged, and then the folders that have become empty."""
         path = self.folder / file
         if self.digests.of_file(path) != digest:
             return
@@ -286,23 +317,15 @@ class Workspace:
                 break
             place.rmdir()
 
-    def _before(self, name: str) -> dict[str, str]:
-        """File -> digest of what a result wrote when it was last made."""
-        files = _files_of(self._record(name), self.folder)
-        if files or name != "output" or self.output is None:
-            return files
-        # an output that is a file keeps no record of it
-        place = report_path(self.output).parent.relative_to(self.folder)
-        return {(place / file).as_posix(): digest for file, digest in digests_in_report(self.output).items()}
-
     def _recover(self) -> None:
-        """What a killed run left: results that were whole come to their place, the others go."""
+        """Repair what a killed run left: complete results move to their place, unfinished ones are removed."""
         for ready in sorted((self.home / "ready").glob("*")):
             if (ready / RECORD).exists():
                 self._settle(ready)
-            else:                                       # its record, the last to go, had come to its place
+            else:                                       # the record moves last, so all files are in place
                 shutil.rmtree(ready)
         shutil.rmtree(self.home / "making", ignore_errors=True)
+        # half-written files of steps
         for half in (self.home / "steps").glob("*/.*.part*"):
             half.unlink()
 
@@ -316,9 +339,9 @@ class Staged:
 
 
 def _read_record(path: Path, folder: Path) -> dict[str, Any] | None:
-    """What the record of a result tells; None where there is none that can be read.
+    """Read the record of a result; None where there is none that can be read.
 
-    StorageError where it names a file that is not in its folder: such a record was not written here.
+    StorageError where it names a file outside its folder: scapekit did not write such a record.
     """
     header = load_step_header(path)
     if header is None or not isinstance(header.get("files"), dict) or not {"digest", "work"} <= set(header):
@@ -329,24 +352,25 @@ def _read_record(path: Path, folder: Path) -> dict[str, Any] | None:
 
 
 def _files_of(record: Path, folder: Path) -> dict[str, str]:
-    """File -> digest of what a result wrote; nothing where there is no record of it."""
+    """Return file -> digest of what a result wrote; empty where it has no record."""
     return dict((_read_record(record, folder) or {"files": {}})["files"])
 
 
 def _plain(name: str) -> str:
-    """A name as that of a file."""
+    """Return a name as a file name."""
     return quote(name, safe=" ")
 
 
 @dataclass(frozen=True, eq=False)
 class KeptSteps:
-    """Steps that are kept in an output; when a step is done, those `inside` it are forgotten."""
+    """Steps kept in an output; a finished step removes the steps inside it."""
 
     space: Workspace
-    found: list[str] = field(default_factory=list)          # the steps that had been done before this run
-    seconds: dict[str, float] = field(default_factory=dict)     # that those which were done now took
+    found: list[str] = field(default_factory=list)          # steps that were done before this run
+    seconds: dict[str, float] = field(default_factory=dict)     # duration of the steps that were run now
 
     def __call__(self, name: str, inputs: Any, make: Callable[[], T]) -> T:
+        """Return the kept result of a step, or run it and note how long it took."""
         begun, made = time.perf_counter(), False
 
         def now(folder: Path) -> T:
@@ -359,5 +383,6 @@ class KeptSteps:
             self.seconds[name] = time.perf_counter() - begun
         elif name not in self.seconds:
             self.found.append(name)
+        # its inner steps are not needed any more
         self.space.drop_others(f"{name}/")
         return value

@@ -1,4 +1,4 @@
-"""The body out of a raw scan: floor, furniture and specks removed, and an account of every piece."""
+"""Clean a raw scan: keep the body, remove floor, furniture and specks, and report every piece."""
 from __future__ import annotations
 
 from dataclasses import dataclass
@@ -14,7 +14,7 @@ from ..ranges import Settings
 from .floor import Plane, find_plane, floor_points
 
 LARGEST, LANDMARKS, NEAR = "the largest piece", "the piece with the landmarks", "near the body"
-MUTUAL, SPARSE = 6, 3.0              # neighbours of a point where points are few, and how far off, in links
+MUTUAL, SPARSE = 6, 3.0              # neighbours linked in sparse regions, and their largest distance in links
 FAR, SPECKS, FLOOR = "apart from the body", "specks", "a plane with all on one side"
 
 
@@ -25,16 +25,21 @@ class CleanScanConfig(Settings):
     Attributes
     ----------
     gap : float, metres
-        Pieces closer than this to the body, or to one that belongs to it, belong to it too: hands and feet that the
-        scanner saw apart. Of a coarse scan at least `STEPS` times its spacing.
+        Pieces closer than this to the body, or to a piece that belongs to it, belong to it: hands and feet that the
+        scanner saw separately. In a coarse scan at least five times its spacing.
     min_points : int
-        Smaller pieces are specks, wherever they are.
+        Smaller pieces are specks.
     planes : int
-        Most floors and walls that are taken off.
+        Largest number of floors and walls that are removed.
     floor_area : float, square metres
-        A plane on which less is measured is no floor; both soles together have about 0.04.
+        A plane with less measured area is no floor; both soles together have about 0.04.
     spacings : float
-        Points closer than this many times the median distance between neighbouring places belong together.
+        Points closer than this many median spacings are linked.
+
+    Examples
+    --------
+    >>> CleanScanConfig(planes=1).gap
+    0.03
     """
 
     gap: float = 0.03
@@ -58,26 +63,25 @@ class Component:
 
 @dataclass(frozen=True, eq=False)
 class CleanedScan:
-    """A scan after `clean_scan`."""
+    """The result of `clean_scan`."""
 
-    scan: Mesh | np.ndarray                 # the body alone, of the same kind as what was given
-    kept: np.ndarray                        # (N,) bool, which points of the raw scan are in it
-    label: np.ndarray                       # (N,) the row in `components` of every point of the raw scan
-    components: tuple[Component, ...]       # planes first, then pieces, largest first, then all specks as one
+    scan: Mesh | np.ndarray                 # the body alone; a mesh or points, as the input
+    kept: np.ndarray                        # (N,) bool: points of the raw scan that are kept
+    label: np.ndarray                       # (N,) the index in `components` of every point of the raw scan
+    components: tuple[Component, ...]       # planes, then pieces, largest first, then all specks together
     floor: Plane | None                     # on which the body stands
 
     @property
     def mesh(self) -> Mesh:
-        """The body as a mesh; without triangles when a point cloud was given."""
+        """The body as a mesh; without triangles if the input was a point cloud."""
         return _as_mesh(self.scan)
 
 
 def cleaning_doubts(found: CleanedScan) -> list[str]:
-    """Why a cleaned scan is to be looked at: a piece that may be a second person was taken for furniture."""
+    """Explain why a cleaned scan needs a look: a dropped piece may be a second person."""
     body = max((max(piece.size) for piece in found.components if piece.kept), default=0.0)
     points = max((piece.points for piece in found.components if piece.kept), default=0)
-    # a piece left out that is so large against the body, and has so many of its points, may be a person: a child has
-    # half
+    # a dropped piece with half of the body's extent, as a child has, and a quarter of its points may be a person
     second = (0.5, 0.25)
     others = [piece for piece in found.components if piece.reason == FAR
               and max(piece.size) >= second[0] * body and piece.points >= second[1] * points]
@@ -86,16 +90,16 @@ def cleaning_doubts(found: CleanedScan) -> list[str]:
 
 
 def take_clutter(scan: Mesh | np.ndarray) -> tuple[Mesh | np.ndarray, float]:
-    """A scan that nobody looked at, without what is clearly not the body; and the share of its points taken off.
+    """Remove clear clutter from a scan without supervision; return the scan and the removed share of its points.
 
-    Where more than `LITTLE` would go, or what may be a second person, nothing does: whoever knows may decide.
+    Nothing is removed if more than 20% would go, or if it may be a second person. The user should decide then.
     """
     try:
         cleaned = clean_scan(scan)
     except ValueError:                 # nothing would be left
         return scan, 0.0
     removed = 1 - float(cleaned.kept.mean())
-    # share of a scan that may be taken off unasked: floor, chair and specks have 0.1
+    # floor, chair and specks have about 0.1 of the points
     return (cleaned.scan, removed) if 0 < removed <= 0.2 and not cleaning_doubts(cleaned) else (scan, 0.0)
 
 
@@ -103,28 +107,37 @@ def clean_scan(scan: Mesh | np.ndarray, config: CleanScanConfig | None = None, l
                rng: np.random.Generator | None = None) -> CleanedScan:
     """Keep the body of a raw scan and drop the floor, walls, furniture and specks.
 
-    A floor is a large plane that has everything else on one side. What lies within its noise belongs to the body
-    inside the outline in which the body meets it, and to the floor elsewhere. Of the rest the largest piece is the
-    body, with the pieces that nearly touch it.
+    A floor is a large plane with everything else on one side. Points within its noise belong to the body inside the
+    body's footprint, else to the floor. Of the rest the largest piece is the body, with the pieces that nearly touch
+    it.
 
     Parameters
     ----------
     scan : Mesh or (N, 3) float, metres
-        Views may lie side by side.
+        The raw scan; it may consist of several views.
     config : CleanScanConfig, optional
+        Settings.
     landmarks : (L, 3) float, metres, optional
-        Points on the body, which then is the piece that most of them are nearest to.
+        Points on the body, to choose its piece; by default the largest piece is the body.
     rng : numpy.random.Generator, optional
-        Draws where planes are tried.
+        Draws the points where planes are tried.
 
     Returns
     -------
     CleanedScan
+        The body, which points (N,) were kept, and every piece with the reason.
 
     Raises
     ------
     ValueError
         A scan without points, or one of which nothing is left.
+
+    Examples
+    --------
+    >>> body = np.random.default_rng(0).normal(size=(3000, 3)) * [0.05, 0.05, 0.2]
+    >>> cleaned = clean_scan(np.vstack([body, [[3.0, 0.0, 0.0]]]))
+    >>> bool(cleaned.kept[-1])
+    False
     """
     config, rng = config or CleanScanConfig(), rng or np.random.default_rng(0)
     scan = sanitise(scan) if isinstance(scan, Mesh) else scan
@@ -133,43 +146,46 @@ def clean_scan(scan: Mesh | np.ndarray, config: CleanScanConfig | None = None, l
     if not len(points):
         raise ValueError("scan: expected points, got none")
     step = spacing(points)
-    link = max(0.012, config.spacings * step)                       # whether triangles join them or not
+    link = max(0.012, config.spacings * step)                       # at least 12 mm, about the spacing of a coarse scan
+    # planes first; then the pieces of the rest, and which of them is the body
     label, planes = _without_planes(mesh, link, config, landmarks, rng)
     rest = np.flatnonzero(label < 0)
     if not len(rest):
         raise ValueError("scan: nothing is left when planes are taken off; expected a body in front of them")
     piece = label_pieces(mesh, rest, link)
     main, why = _body_of(points[rest], piece, config, landmarks)
-    # All specks together are one row: a scanned floor leaves hundreds.
+    # report all specks in one row: a scanned floor leaves hundreds
     size = np.bincount(piece)
     large = np.flatnonzero((size >= config.min_points) | (np.arange(len(size)) == main))
     row_of = np.full(len(size), len(large))
     row_of[large] = np.arange(len(large))
     label[rest] = len(planes) + row_of[piece]
     body = cKDTree(points[rest[piece == main]])
-    # spacings between the steps of a depth camera on a surface that it sees slantwise
+    # five spacings: steps of a depth camera on an oblique surface
     near = _near_pieces([points[rest[piece == number]] for number in large], int(np.flatnonzero(large == main)[0]),
                         max(config.gap, 5.0 * step))
+    # one row per plane, per piece, and for all specks: reason, gap to the body, kept or not
     rows = []
     for number in range(int(label.max()) + 1):
-        mine = label == number
+        own = label == number
         old = number - len(planes) if len(planes) <= number < len(planes) + len(large) else None
         reason = (FLOOR if number < len(planes) else SPECKS if old is None else why if large[old] == main
                   else NEAR if near[old] else FAR)
-        gap = 0.0 if reason == why else _gap(body, points[mine])
-        rows.append(_component(mesh, mine, gap, reason in (why, NEAR), reason))
+        gap = 0.0 if reason == why else _gap(body, points[own])
+        rows.append(_component(mesh, own, gap, reason in (why, NEAR), reason))
     kept = np.array([row.kept for row in rows])[label]
     floor = next((p for p in planes if p.height(body.data).min() <= config.gap), None)
     return CleanedScan(_only(scan, kept), kept, label, tuple(rows), floor)
 
 
 def _as_mesh(scan: Mesh | np.ndarray) -> Mesh:
+    """Return a scan as a mesh; points get no triangles."""
     return scan if isinstance(scan, Mesh) else Mesh(scan, np.zeros((0, 3), dtype=np.int64))
 
 
 def _without_planes(mesh: Mesh, link: float, config: CleanScanConfig, landmarks: np.ndarray | None,
                     rng: np.random.Generator) -> tuple[np.ndarray, list[Plane]]:
-    """The number of the plane that each vertex (N,) lies on, -1 for none, and the planes."""
+    """Find floors and walls: the number of the plane of each vertex (N,), -1 for none, and the planes."""
     points, planes = mesh.vertices, list[Plane]()
     label = np.full(len(points), -1)
     while len(planes) < config.planes and (label < 0).sum() > config.min_points:
@@ -177,6 +193,7 @@ def _without_planes(mesh: Mesh, link: float, config: CleanScanConfig, landmarks:
         plane = find_plane(points[rest], config.floor_area, rng)
         if plane is None:
             break
+        # the body stands on the plane; its footprint is not removed
         standing = rest[plane.height(points[rest]) > plane.thickness]
         piece = label_pieces(mesh, standing, link)
         body = standing[piece == _body_of(points[standing], piece, config, landmarks)[0]] if len(standing) else standing
@@ -186,16 +203,16 @@ def _without_planes(mesh: Mesh, link: float, config: CleanScanConfig, landmarks:
 
 
 def label_pieces(mesh: Mesh, chosen: np.ndarray, link: float) -> np.ndarray:
-    """Number of the piece that each of the chosen vertices (n,) belongs to, largest piece 0.
+    """Number the connected pieces of the chosen vertices (n,), largest piece 0.
 
-    Vertices hang together when a side of a triangle joins them or when they are closer than about `link` metres.
+    Vertices are linked by sides of triangles, or if they are closer than about `link` metres.
     """
     points = mesh.vertices[chosen]
     new = np.full(len(mesh.vertices), -1)
     new[chosen] = np.arange(len(chosen))
     sides = new[np.concatenate([mesh.faces[:, [0, 1]], mesh.faces[:, [1, 2]]])]
     sides = sides[(sides >= 0).all(axis=1)]
-    # One point of every small cell stands for all of it, so that dense scans do not take long.
+    # one point per small cell represents it, so that dense scans are fast
     place = np.floor((points - points.min(axis=0, initial=np.inf)) / (link / 2)).astype(np.int64)
     _, first, cell = np.unique(place, axis=0, return_index=True, return_inverse=True)
     near = np.concatenate([cKDTree(points[first]).query_pairs(link, output_type="ndarray"),
@@ -203,21 +220,21 @@ def label_pieces(mesh: Mesh, chosen: np.ndarray, link: float) -> np.ndarray:
     a = np.concatenate([sides[:, 0], first[near[:, 0]], np.arange(len(points))])
     b = np.concatenate([sides[:, 1], first[near[:, 1]], first[cell.reshape(-1)]])
     label = label_components(a, b, len(points))
-    size = np.bincount(label[first])                    # by cells, not by points, which crowd near the scanner
+    size = np.bincount(label[first])                    # in cells, as points are denser near the scanner
     rank = np.argsort(np.argsort(-size, kind="stable"), kind="stable")
     return np.asarray(rank[label])
 
 
 def _sparse_links(points: np.ndarray, link: float, longest: float) -> np.ndarray:
-    """Pairs (n, 2) of points farther apart than `link` and up to `longest` metres that are among each other's nearest.
+    """Find pairs (n, 2) of mutual nearest neighbours in sparse regions, `link` to `longest` metres apart.
 
-    Only where points are few: with less than `MUTUAL` others within a link, which do not count among the nearest. The
-    pairs join a side that was seen from afar, or by one view where others overlap, to itself; two surfaces hardly.
+    A region is sparse if a point has less than `MUTUAL` others within a link. The pairs connect surface that was seen
+    from afar, or by one view only. They hardly ever connect two surfaces.
     """
     if len(points) < 2:
         return np.zeros((0, 2), dtype=np.int64)
     apart, near = cKDTree(points).query(points, min(2 * MUTUAL, len(points)), distance_upper_bound=longest)
-    far = (apart > link) & (near < len(points)) & ((apart <= link).sum(axis=1, keepdims=True) <= MUTUAL)   # with itself
+    far = (apart > link) & (near < len(points)) & ((apart <= link).sum(axis=1, keepdims=True) <= MUTUAL)  # incl. itself
     far &= np.cumsum(far, axis=1) <= MUTUAL
     a, b = np.nonzero(far)[0], near[far]
     return np.stack([a, b], axis=1)[np.isin(a * len(points) + b, b * len(points) + a)]
@@ -225,18 +242,18 @@ def _sparse_links(points: np.ndarray, link: float, longest: float) -> np.ndarray
 
 def _body_of(points: np.ndarray, piece: np.ndarray, config: CleanScanConfig, landmarks: np.ndarray | None
              ) -> tuple[int, str]:
-    """The piece that is the body, and why."""
+    """Choose the piece that is the body, and say why: by landmarks, else the largest."""
     if landmarks is None:
         return 0, LARGEST
     large = np.bincount(piece)[piece] >= config.min_points
     if not large.any():
         large = np.ones(len(piece), dtype=bool)
-    found = piece[large][cKDTree(points[large]).query(np.reshape(landmarks, (-1, 3)))[1]]
-    return int(np.bincount(found).argmax()), LANDMARKS
+    marked = piece[large][cKDTree(points[large]).query(np.reshape(landmarks, (-1, 3)))[1]]
+    return int(np.bincount(marked).argmax()), LANDMARKS
 
 
 def _near_pieces(clouds: list[np.ndarray], main: int, gap: float) -> np.ndarray:
-    """(n,) bool: pieces (m, 3) that a chain of pieces, each within `gap` metres of the next, joins to the main one."""
+    """Find pieces (n,) bool, each (m, 3), connected to the main one by a chain of gaps of at most `gap` metres."""
     near = np.arange(len(clouds)) == main
     last = near.copy()
     while last.any():
@@ -247,19 +264,21 @@ def _near_pieces(clouds: list[np.ndarray], main: int, gap: float) -> np.ndarray:
 
 
 def _gap(body: cKDTree, points: np.ndarray) -> float:
-    """The least distance; a few points first, because far queries take long without a bound."""
+    """Return the smallest distance; some points first, because distant queries are slow without a bound."""
     bound = float(body.query(points[::max(len(points) // 300, 1)])[0].min())
     return min(bound, float(body.query(points, distance_upper_bound=bound + 1e-12)[0].min()))
 
 
-def _component(mesh: Mesh, mine: np.ndarray, gap: float, kept: bool, reason: str) -> Component:
-    points = mesh.vertices[mine]
-    area = float(mesh.face_areas[mine[mesh.faces].all(axis=1)].sum()) if len(mesh.faces) else float("nan")
+def _component(mesh: Mesh, own: np.ndarray, gap: float, kept: bool, reason: str) -> Component:
+    """Describe one piece for the report."""
+    points = mesh.vertices[own]
+    area = float(mesh.face_areas[own[mesh.faces].all(axis=1)].sum()) if len(mesh.faces) else float("nan")
     size = tuple(np.ptp(points, axis=0).tolist()) if len(points) else (0.0, 0.0, 0.0)
     return Component(len(points), area, size, gap, kept, reason)
 
 
 def _only(scan: Mesh | np.ndarray, kept: np.ndarray) -> Mesh | np.ndarray:
+    """Return the kept points (N,) bool of a scan, as a mesh if it was one."""
     if not isinstance(scan, Mesh):
         return np.asarray(scan)[kept]
     if not len(scan.faces):

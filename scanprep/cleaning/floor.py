@@ -1,4 +1,4 @@
-"""The floor under a scanned body, found and taken off without the soles."""
+"""Find the floor under a scanned body, and separate it from the soles."""
 from __future__ import annotations
 
 from dataclasses import dataclass
@@ -7,58 +7,60 @@ import numpy as np
 from scipy import ndimage
 from scipy.spatial import cKDTree
 
-WIDEST = 0.03              # metres: farthest distance of the points that a first guess is fitted to
-SIGMAS = 3.5               # standard deviations from a floor within which points are on it
+WIDEST = 0.03              # metres: half-width of the band around a first guess; scanned floors are flatter
+SIGMAS = 3.5               # points within so many standard deviations are on the floor: 99.95% of Gaussian noise
 
 
 @dataclass(frozen=True)
 class Plane:
-    """A plane with what was measured on it in front."""
+    """A plane measured with noise; its normal points to the body."""
 
     normal: np.ndarray          # (3,) unit, towards the body
-    offset: float               # of points x on the plane, `normal @ x`, metres
-    noise: float                # standard deviation of the points that were measured on it, metres
+    offset: float               # `normal @ x` of points x on the plane, metres
+    noise: float                # standard deviation of the measured points, metres
 
     @property
     def thickness(self) -> float:
-        """Points within this distance, metres, are on it."""
+        """Points within this distance, metres, count as on the plane."""
         return SIGMAS * self.noise
 
     def height(self, points: np.ndarray) -> np.ndarray:
-        """Distances (n,) of points (n, 3) in front of the plane, metres."""
+        """Return signed distances (n,), metres, of points (n, 3); positive in front of the plane."""
         return np.asarray(points @ self.normal - self.offset)
 
     def flat(self, points: np.ndarray) -> np.ndarray:
-        """Coordinates (n, 2) of points along the plane, metres."""
+        """Return coordinates (n, 2), metres, of points in the plane."""
         u = np.cross(self.normal, np.eye(3)[np.abs(self.normal).argmin()])
         u /= np.linalg.norm(u)
         return points @ np.stack([u, np.cross(self.normal, u)], axis=1)
 
     def flip(self) -> Plane:
-        """The same plane from behind."""
+        """Return the plane with the opposite normal."""
         return Plane(-self.normal, -self.offset, self.noise)
 
 
 def find_plane(points: np.ndarray, min_area: float, rng: np.random.Generator) -> Plane | None:
-    """The largest plane that has nearly all points (n, 3) on it or on one side of it; None below `min_area` m².
+    """Find the largest plane with nearly all points (n, 3) on it or on one side; None below `min_area` m².
 
-    Guesses go through single points along the normal of their neighbourhood; the best is fitted to ever closer points.
+    Candidates are tangent planes at random points; the best one is refined on ever closer points.
     """
-    few = points[rng.permutation(len(points))[:10_000]]
-    tree = cKDTree(few)
+    sample = points[rng.permutation(len(points))[:10_000]]
+    tree = cKDTree(sample)
     best, best_area = None, min_area
-    most_below = 0.01  # share of all points that may lie behind a floor
-    for seed in rng.choice(len(few), min(150, len(few)), replace=False):
-        near = few[tree.query_ball_point(few[seed], 2 * WIDEST)]
+    most_below = 0.01  # share of points that may lie behind a floor: specks and reflections
+    for seed in rng.choice(len(sample), min(150, len(sample)), replace=False):
+        # tangent plane of the neighbourhood; the side with more points is the front
+        near = sample[tree.query_ball_point(sample[seed], 2 * WIDEST)]
         if len(near) < 6:
             continue
         plane = _fit(near)
-        height = plane.height(few)
+        height = plane.height(sample)
         if np.mean(height < -WIDEST) > np.mean(height > WIDEST):
             plane, height = plane.flip(), -height
         if np.mean(height < -WIDEST) > most_below:
             continue
-        area = _area_of_cells(plane.flat(few[np.abs(height) < WIDEST / 2]), WIDEST)
+        # measured area, in cells of 3 cm
+        area = _area_of_cells(plane.flat(sample[np.abs(height) < WIDEST / 2]), WIDEST)
         if area > best_area:
             best, best_area = plane, area
     if best is None:
@@ -66,7 +68,7 @@ def find_plane(points: np.ndarray, min_area: float, rng: np.random.Generator) ->
     plane = _refine(best, points)
     height = plane.height(points)
     on_it = np.abs(height) <= plane.thickness
-    if (plane.noise > 2 * local_noise(points, rng)           # a back is nearly flat, but only nearly
+    if (plane.noise > 2 * local_noise(points, rng)           # curved surface such as a back is no floor
             or np.mean(height < -WIDEST / 2) > most_below
             or _area_of_cells(plane.flat(points[on_it]), WIDEST) < min_area):
         return None
@@ -74,7 +76,7 @@ def find_plane(points: np.ndarray, min_area: float, rng: np.random.Generator) ->
 
 
 def local_noise(points: np.ndarray, rng: np.random.Generator) -> float:
-    """Standard deviation, metres, of points (n, 3) from planes through their nearest neighbours: the median."""
+    """Estimate the noise of points (n, 3), metres: median deviation from planes through their nearest neighbours."""
     near = min(16, len(points))
     index = cKDTree(points).query(points[rng.choice(len(points), min(500, len(points)), replace=False)], near)[1]
     patch = points[index.reshape(-1, near)]
@@ -83,23 +85,24 @@ def local_noise(points: np.ndarray, rng: np.random.Generator) -> float:
 
 
 def floor_points(points: np.ndarray, plane: Plane, body: np.ndarray) -> np.ndarray:
-    """(n,) bool: points (n, 3) on a floor outside the footprint of the body (m, 3), and those under it."""
+    """Find points (n,) bool on a floor outside the footprint of the body (m, 3), and points below the floor."""
     band = plane.thickness
     height = plane.height(points)
     on_it = np.abs(height) <= band
     above = plane.height(body)
-    low = plane.flat(body[(above > band) & (above < band + 0.03)])         # what shows where it stands
+    low = plane.flat(body[(above > band) & (above < band + 0.03)])         # the lowest 3 cm: its footprint
     on_it[on_it] = ~inside_outline(plane.flat(points[on_it]), low, bridge=0.015)
     return np.asarray(on_it | (height < -band))
 
 
 def inside_outline(points: np.ndarray, outline: np.ndarray, bridge: float) -> np.ndarray:
-    """(n,) bool: points (n, 2) on or inside the closed curves that other points (m, 2) trace.
+    """Find points (n,) bool, of (n, 2), on or inside the closed curves that other points (m, 2) trace.
 
     Gaps up to `bridge` metres are closed.
     """
     if not len(outline) or not len(points):
         return np.zeros(len(points), dtype=bool)
+    # draw the outline into a grid, close gaps by dilation, fill it, and erode it back
     cell = bridge / 3
     start = outline.min(axis=0) - 3 * bridge
     place = ((outline - start) / cell).astype(int)
@@ -116,19 +119,20 @@ def inside_outline(points: np.ndarray, outline: np.ndarray, bridge: float) -> np
 
 
 def _area_of_cells(flat: np.ndarray, cell: float) -> float:
-    """Square metres of the cells, `cell` metres wide, that have one of the points (n, 2)."""
+    """Compute the area, square metres, of the cells of width `cell`, metres, that contain points (n, 2)."""
     place = np.floor((flat - flat.min(axis=0, initial=np.inf)) / cell).astype(np.int64)
     return len(np.unique(place[:, 0] * (place[:, 1].max(initial=0) + 1) + place[:, 1])) * cell**2
 
 
 def _fit(points: np.ndarray) -> Plane:
+    """Fit a plane to points (n, 3) by least squares."""
     centre = points.mean(axis=0)
     spread, axes = np.linalg.eigh(np.cov(points.T, bias=True))
     return Plane(axes[:, 0], float(axes[:, 0] @ centre), float(np.sqrt(max(spread[0], 0.0))))
 
 
 def _refine(plane: Plane, points: np.ndarray) -> Plane:
-    """Fitted to points that are closer every time, the noise by the median so that feet do not count."""
+    """Refine a plane on ever closer points; the noise is a robust estimate, so that feet do not count."""
     band = WIDEST
     for _ in range(8):
         height = plane.height(points)
@@ -136,6 +140,7 @@ def _refine(plane: Plane, points: np.ndarray) -> Plane:
         fitted = _fit(near)
         if fitted.normal @ plane.normal < 0:
             fitted = fitted.flip()
+        # standard deviation from the median; keep points within three of them
         noise = 1.4826 * float(np.median(np.abs(fitted.height(near))))
         plane = Plane(fitted.normal, fitted.offset, max(noise, 1e-5))
         band = min(band, max(3 * plane.noise, 1e-4))

@@ -1,4 +1,4 @@
-"""Pairs of places on a template and a scan, however they were found, and their JSON file.
+"""Corresponding points of a template and a scan, and their JSON file.
 
     {"kind": "correspondences", "version": 1, "method": "...", "converged": true, "energies": {...},
      "pairs": [{"vertex": 8120, "point": [x, y, z], "confidence": 0.93}, ...]}
@@ -19,13 +19,29 @@ KIND, VERSION = "correspondences", 1
 
 @dataclass(frozen=True, eq=False)
 class Correspondences:
-    """Which vertex of the template lies where on the scan."""
+    """Corresponding points: vertices of the template and points of the scan.
 
-    template_vertices: np.ndarray    # (C,) int
-    scan_points: np.ndarray          # (C, 3) metres
-    confidence: np.ndarray           # (C,) from 0, a guess, to 1, certain
-    method: str = ""                 # how they were found
-    energies: dict[str, float] = field(default_factory=dict)     # what was minimised, and other figures of the search
+    Attributes
+    ----------
+    template_vertices : (C,) int
+        Vertices of the template.
+    scan_points : (C, 3) float, metres
+        Their positions on the scan.
+    confidence : (C,) float
+        From 0, a guess, to 1, certain.
+    method : str
+        How they were found.
+    energies : dict of str to float
+        What was minimised, and other figures of the search.
+    converged : bool
+        Belief propagation converged, and the matching of limb ends was clear.
+    """
+
+    template_vertices: np.ndarray
+    scan_points: np.ndarray
+    confidence: np.ndarray
+    method: str = ""
+    energies: dict[str, float] = field(default_factory=dict)
     converged: bool = True
 
     def __len__(self) -> int:
@@ -34,7 +50,7 @@ class Correspondences:
 
 def check_pairs(template: Mesh, vertices: np.ndarray, points: np.ndarray, name: str, least: int = 3
                 ) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices (L,) of a template and their places (L, 3), or ValueError that names the argument they came by."""
+    """Check vertices (L,) of a template and their points (L, 3); ValueError names the argument `name`."""
     vertices, points = np.asarray(vertices), np.asarray(points, dtype=np.float64)
     if vertices.ndim != 1 or not np.issubdtype(vertices.dtype, np.integer):
         raise ValueError(f"{name}: expected vertex numbers of shape (L,), got {vertices.dtype} "
@@ -52,26 +68,26 @@ def check_pairs(template: Mesh, vertices: np.ndarray, points: np.ndarray, name: 
 
 
 def correspondences_doubts(found: Correspondences) -> list[str]:
-    """Why correspondences are to be looked at: limbs may have been mistaken for each other."""
+    """Explain why correspondences need a look: limbs may have been confused."""
     sure = float(np.median(found.confidence)) if len(found) else 0.0
-    # Median confidence of correspondences, below which they mean nothing, and from which they are right. Right ones
+    # A median confidence from 0.77 on is right; below 0.55 it is meaningless (`correspondences_problem`). Right ones
     # have 0.81 to 0.87 on five real scans of the template's kind, 0.79 and 0.81 on two others, 0.72 on a person with
-    # long hair. Of mistaken limbs two scans have 0.66 and 0.73, three of a depth camera 0.31 to 0.43; a ball has 0.25
-    # to 0.37.
+    # long hair. With confused limbs two scans have 0.66 and 0.73, three of a depth camera 0.31 to 0.43. A ball has
+    # 0.25 to 0.37.
     return [f"the median confidence is {sure:.2f}: limbs may be mistaken for each other"] if sure < 0.77 else []
 
 
 def correspondences_problem(found: Correspondences) -> str | None:
-    """Why correspondences mean nothing, with the likely cause; None where they mean something."""
+    """Explain why correspondences are meaningless, with the likely cause; None where they are not."""
     sure = float(np.median(found.confidence)) if len(found) else 0.0
-    if sure >= 0.55:
+    if sure >= 0.55:                     # see `correspondences_doubts`
         return None
     return (f"{len(found)} pairs were found with a median confidence of {sure:.2f}; a scan of something else, too "
             "little of the body, or landmarks of other places?")
 
 
 def write_correspondences(path: str | Path, found: Correspondences) -> None:
-    """Write correspondences, whole or not at all; points are in metres."""
+    """Write correspondences to a JSON file, atomically; points are in metres."""
     rows = zip(found.template_vertices.tolist(), np.asarray(found.scan_points).tolist(), found.confidence.tolist(),
                strict=True)
     storage.write_json(path, {
@@ -81,7 +97,7 @@ def write_correspondences(path: str | Path, found: Correspondences) -> None:
 
 
 def read_correspondences(path: str | Path) -> Correspondences:
-    """Read correspondences; StorageError where they are missing, damaged, or something else."""
+    """Read correspondences from a JSON file; StorageError where it is missing, damaged, or something else."""
     expected = "expected correspondences in JSON"
     stored = storage.read_json(path, "correspondences")
     if not isinstance(stored, dict) or stored.get("kind") != KIND:

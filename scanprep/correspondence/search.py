@@ -1,4 +1,4 @@
-"""Correlated correspondence from given seeds: two surfaces seen from the seeds, and what is believed of them."""
+"""Correlated correspondence from given seeds: features of both surfaces, and beliefs about images of scan points."""
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
@@ -19,14 +19,14 @@ from .sheet import Sheet
 
 @dataclass(frozen=True)
 class BeliefLevel(Settings):
-    """One level from coarse to fine.
+    """One level of belief propagation, from coarse to fine.
 
     Attributes
     ----------
     places : int
-        Places of the template: up to 2000 are spread over it, more than that had better be all.
+        Candidate vertices of the template. Up to 2000 are spread evenly; for more, use all.
     domain : int
-        Of them, how many a point of the scan may choose from.
+        Candidates that each point of the scan keeps, the likeliest ones.
     """
 
     places: Count
@@ -40,14 +40,19 @@ class CorrelatedConfig(Settings):
     Attributes
     ----------
     points : int
-        Points of the scan that look for an image.
+        Points of the scan for which an image is sought.
     keep : int
-        Most correspondences in the result: the most certain ones.
+        Largest number of correspondences in the result, the most confident ones.
     spacing : float
-        Distance that the scan is thinned to, as a multiple of the template's size, √area.
-    levels : from coarse to fine
+        Distance to which the scan is thinned, as a multiple of the template's size, √area.
+    levels : levels of belief propagation, coarse to fine
     iterations : int
-        Most rounds of messages at each level.
+        Largest number of message rounds at each level.
+
+    Examples
+    --------
+    >>> len(CorrelatedConfig(points=100).levels)
+    3
     """
 
     points: Count = 240
@@ -59,10 +64,10 @@ class CorrelatedConfig(Settings):
 
 @dataclass(frozen=True, eq=False)
 class Surfaces:
-    """Points of the scan that look for an image, and places of the template among which they choose.
+    """Points of the scan for which images are sought, and candidate places on the template.
 
-    `edges` (E, 2) join neighbours among the former; `vertices` (m,) are where the latter lie, `scale` how much larger
-    the scan is than the template, whose places are scaled to it.
+    `edges` (E, 2) join neighbouring points of the scan. `vertices` (m,) are the template vertices of the places.
+    `scale` says how much larger the scan is than the template; places are scaled to it.
     """
 
     size: float
@@ -75,7 +80,7 @@ class Surfaces:
 
 @dataclass(frozen=True, eq=False)
 class Images:
-    """What is believed: states of every point (n,) within its domain (n, K) of places; K means no image."""
+    """Beliefs: the state of every point (n,) within its domain (n, K) of places; state K means no image."""
 
     domains: np.ndarray
     beliefs: Beliefs
@@ -83,26 +88,27 @@ class Images:
 
     @property
     def found(self) -> np.ndarray:
-        """(n,) bool: an image was found."""
+        """(n,) bool: the point has an image."""
         return self.beliefs.states < self.domains.shape[1]
 
     @property
     def chosen(self) -> np.ndarray:
-        """(n,) the place of each, any where none was found."""
+        """(n,) int: the place of each point; arbitrary where it has no image."""
         state = np.minimum(self.beliefs.states, self.domains.shape[1] - 1)
         return self.domains[np.arange(len(state)), state]
 
 
 def propagate_beliefs(surfaces: Surfaces, before: Images | None, level: BeliefLevel, config: CorrelatedConfig
                       ) -> tuple[Surfaces, Images]:
-    """Belief propagation over the places of one level, in domains pruned by what is known; the template rescaled."""
+    """Run belief propagation at one level, in domains pruned by earlier beliefs, and rescale the template."""
+    # candidates of each point: the best by unary energy, later the likeliest near earlier images
     spread = np.arange(min(level.places, len(surfaces.places)))
     unary = place_energy(surfaces.scan, surfaces.places[spread], surfaces.size)
     wanted = unary if before is None else -_spread_beliefs(surfaces, before, spread)
     domains = np.argsort(wanted, axis=1)[:, :level.domain]
     n, K = domains.shape
-    # The field has one more state that says: no image. It costs half of what the worst one may cost, and so does each
-    # edge to it. All that speaks for a single image counts half.
+    # one more state means "no image": it costs half of the largest unary energy, and its edges half of the largest
+    # pairwise one; unary energies count half, because they overlap with the pairwise ones
     energies = np.full((n, K + 1), 0.5 * 0.5 * most_place_energy(surfaces.scan.to_seeds.shape[1]))
     energies[:, :K] = 0.5 * np.take_along_axis(unary, domains, axis=1)
     domains = spread[domains]
@@ -111,7 +117,7 @@ def propagate_beliefs(surfaces: Surfaces, before: Images | None, level: BeliefLe
     field = PairField(energies, surfaces.edges, pairwise)
     beliefs = propagate(field, config.iterations)
     images = Images(domains, beliefs, field.energy(beliefs.states))
-    # The template is scaled by the edges whose images are known: bending changes paths, but not short edges.
+    # rescale the template by the short edges whose ends have images: bending changes long paths, but not short edges
     i, j = surfaces.edges[images.found[surfaces.edges].all(axis=1)].T
     x, y = surfaces.scan.points, surfaces.places.points[images.chosen]
     far = np.linalg.norm(y[i] - y[j], axis=1)
@@ -122,29 +128,31 @@ def propagate_beliefs(surfaces: Surfaces, before: Images | None, level: BeliefLe
 
 
 def result(surfaces: Surfaces, images: Images, config: CorrelatedConfig) -> Correspondences:
-    """The images found, most certain first: by the belief near the one chosen, and the strain of the edges around."""
-    found, K = np.flatnonzero(images.found), images.domains.shape[1]
-    image, domains = images.chosen[found], images.domains[found]
+    """Collect the correspondences, most confident first: by beliefs near the chosen image and strain of its edges."""
+    # belief within 3% of the size of the chosen image: neighbouring vertices are as good
+    matched, K = np.flatnonzero(images.found), images.domains.shape[1]
+    image, domains = images.chosen[matched], images.domains[matched]
     apart = np.linalg.norm(surfaces.places.points[domains] - surfaces.places.points[image][:, None], axis=2)
-    sure = (images.beliefs.probabilities[found, :K] * (apart < 0.03 * surfaces.size)).sum(axis=1)
+    sure = (images.beliefs.probabilities[matched, :K] * (apart < 0.03 * surfaces.size)).sum(axis=1)
     # mean energy of the edges around every point, each with the images chosen
     edges = surfaces.edges[images.found[surfaces.edges].all(axis=1)]
     cost = edge_energy(surfaces.scan, surfaces.places, edges, images.chosen[:, None], surfaces.size)[:, 0, 0]
     total, count = (np.bincount(edges.ravel(), np.repeat(w, 2), len(images.domains))
                     for w in (cost, np.ones(len(edges))))
-    confidence = sure * np.exp(-(total / np.maximum(count, 1))[found] / 4.0)
+    # a mean edge energy of 4 divides the confidence by e
+    confidence = sure * np.exp(-(total / np.maximum(count, 1))[matched] / 4.0)
     order = np.argsort(-confidence, kind="stable")[:config.keep]
     energies = {"field": images.energy, "scale": surfaces.scale,
-                "without_image": float(len(images.domains) - len(found))}
-    return Correspondences(surfaces.vertices[image[order]], surfaces.scan.points[found[order]], confidence[order],
+                "without_image": float(len(images.domains) - len(matched))}
+    return Correspondences(surfaces.vertices[image[order]], surfaces.scan.points[matched[order]], confidence[order],
                            "correlated", energies, images.beliefs.converged)
 
 
 @dataclass(frozen=True, eq=False)
 class Seeds:
-    """Places known to belong together, and the ways from them (S, N) and (S, n), metres, to all of both surfaces.
+    """Known correspondences, and the path lengths (S, N) and (S, n), metres, from them over both surfaces.
 
-    Vertices (S,) of the template, places (S, 3) on the scan, and the points (S,) of the sheet nearest to these.
+    Vertices (S,) of the template, points (S, 3) on the scan, and the nearest points (S,) of its sheet.
     """
 
     vertices: np.ndarray
@@ -155,19 +163,19 @@ class Seeds:
 
 
 def surfaces_of(template: Mesh, sheet: Sheet, seeds: Seeds, config: CorrelatedConfig) -> Surfaces:
-    """Template and scan seen from seeds."""
+    """Compute the features of template and scan relative to the seeds."""
     size = float(np.sqrt(template.face_areas.sum()))
     clicked, on_scan, on_template = seeds.points, seeds.on_scan, seeds.on_template
-    # how much larger the scan is, by the distances between seeds: bending changes some of them
+    # scale of the scan: the median ratio of path lengths between seeds, as bending changes some of them
     a, b = np.triu_indices(len(clicked), 1)
     far, near = on_template[a, seeds.vertices[b]], on_scan[a, clicked[b]]
     good = np.isfinite(far) & np.isfinite(near) & (far > 0) & (near > 0)
     scale = float(np.median(near[good] / far[good])) if good.any() else 1.0
     chosen, edges = sheet.spread(config.points, 0.3 * size)
-    off = np.linalg.norm(sheet.points[clicked] - seeds.places, axis=1)     # a click where there are no data
+    off = np.linalg.norm(sheet.points[clicked] - seeds.places, axis=1)     # far for a click without data
     same = (sheet.piece[chosen][:, None] == sheet.piece[clicked]) & (off < 3 * sheet.spacing)
-    # a way that bridges a gap of the scan, or ends in one, is trusted less
-    radius = 0.042 * size                                                  # over which directions are averaged
+    # a path that crosses a gap of the scan, or ends in one, has a trust of 0.3
+    radius = 0.042 * size                                                  # averages directions over 6 cm on a man
     scan = distance_profile(sheet.points, sheet.normals, on_scan, chosen, radius, np.where(same, 1.0, 0.3))
     vertices = _spread_vertices(template, min(max(level.places for level in config.levels), len(template.vertices)))
     places = distance_profile(scale * template.vertices, template.vertex_normals, scale * on_template, vertices, radius,
@@ -177,24 +185,17 @@ def surfaces_of(template: Mesh, sheet: Sheet, seeds: Seeds, config: CorrelatedCo
 
 @lru_cache(maxsize=4)                # a folder of scans shares one template
 def _spread_vertices(template: Mesh, count: int) -> np.ndarray:
-    """So many vertices (count,), of which the first 2000, however few are taken, are spread over the template."""
+    """Order vertices (count,): up to 2000 spread over the template first, then the rest."""
     first = farthest_points(template.vertices, min(count, 2000))
     rest = np.setdiff1d(np.arange(len(template.vertices)), first)
     return np.concatenate([first, rest])[:count]
 
 
-def _scale_between(template: np.ndarray, scan: np.ndarray) -> float:
-    """How much larger the scan is, by the distances (S, S) between seeds: bending changes some of them."""
-    a, b = np.triu_indices(len(template), 1)
-    far, near = template[a, b], scan[a, b]
-    good = np.isfinite(far) & np.isfinite(near) & (far > 0) & (near > 0)
-    return float(np.median(near[good] / far[good])) if good.any() else 1.0
-
-
 def _spread_beliefs(surfaces: Surfaces, images: Images, places: np.ndarray) -> np.ndarray:
-    """Beliefs so far, spread over other places near by: (n, m), not normalised."""
+    """Spread earlier beliefs over nearby places (n, m), not normalised."""
     n, K = images.domains.shape
     reach = 0.012 * surfaces.size
+    # beliefs at the old places, blurred by a Gaussian of 1.2% of the size (17 mm on a man), cut at three widths
     old, column = np.unique(images.domains, return_inverse=True)
     p = np.zeros((n, len(old)))
     np.add.at(p, (np.repeat(np.arange(n), K), column.ravel()), images.beliefs.probabilities[:, :K].ravel())

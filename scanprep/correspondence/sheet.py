@@ -1,4 +1,4 @@
-"""A scan of one or many sheets as one surface: points, normals, and paths that cross sheets but no gaps."""
+"""A scan of one or many sheets as one surface: points, normals, and paths across overlapping sheets but not gaps."""
 from __future__ import annotations
 
 import numpy as np
@@ -12,22 +12,22 @@ from ..geometry.target import Target
 
 
 class Sheet:
-    """Points of a scan, thinned to a spacing (metres), and the graph of short ways between them.
+    """Points of a scan, thinned to a spacing (metres), and the graph of neighbours.
 
-    Points of overlapping sheets are neighbours of each other; two points that face each other across a gap, or
-    lie on the two sides of a thin part, are not. `piece` (n,) is the connected piece of each point; `surface` and
-    `graph` (n, n) hold the lengths of the ways, metres, without and with the bridges that join the larger pieces.
+    Points of overlapping sheets are neighbours. Points that face each other across a gap, or lie on the two sides of a
+    thin part, are not. `piece` (n,) is the connected component of each point. `surface` and `graph` (n, n) hold edge
+    lengths, metres, without and with bridges between the larger components.
     """
 
     REACH = 2.6          # radius of the neighbourhood, in spacings: about twenty neighbours
     TURN = 0.1           # least cosine between the normals of neighbours
-    SLANT = 0.6          # most sine between an edge and the tangent plane of the middle
+    SLANT = 0.6          # largest sine between an edge and the mean tangent plane
     CREASE = 0.35        # normals that lean towards each other by more than this face each other
 
     def __init__(self, target: Target, spacing: float) -> None:
         keep = thin(target.points, spacing)
         self.spacing = spacing
-        # points and normals, each the mean over those close by that face the same way: less noise
+        # average points and normals over close neighbours that face the same way: less noise
         near_distance, near = cKDTree(target.points).query(target.points[keep], min(24, len(target.points)))
         cosine = np.einsum("nkd,nd->nk", target.normals[near], target.normals[keep])
         sign = np.where(cosine < 0, -1.0, 1.0) if not target.oriented else np.ones_like(cosine)
@@ -45,6 +45,7 @@ class Sheet:
         self._spread: dict[tuple[int, float], tuple[np.ndarray, np.ndarray]] = {}
 
     def _edges(self) -> csr_array:
+        """Link neighbours on one surface: alike normals, an edge along the surface, and not facing each other."""
         reach = self.REACH * self.spacing
         i, j = cKDTree(self.points).query_pairs(reach, output_type="ndarray").T
         along = self.points[j] - self.points[i]
@@ -59,13 +60,13 @@ class Sheet:
         return _symmetric(i[good], j[good], length[good], len(self.points))
 
     def distances(self, sources: np.ndarray, limit: float = np.inf) -> np.ndarray:
-        """(S, n) metres from points of the sheet (S,) to all; infinite where no way leads."""
+        """Compute path lengths (S, n), metres, from points (S,) to all; infinite where unreachable."""
         return dijkstra(self.graph, directed=False, indices=sources, limit=limit)
 
     def spread(self, count: int, limit: float) -> tuple[np.ndarray, np.ndarray]:
-        """So many points (count,) far from each other, and pairs (E, 2) of them.
+        """Choose points (count,) far from each other, and neighbouring pairs (E, 2) of them.
 
-        Each is in pairs with the six nearest to it along the surface, none farther than `limit` metres.
+        Each point pairs with its six nearest along the surface, none farther than `limit` metres.
         """
         if (count, limit) not in self._spread:
             chosen = farthest_points(self.points, count)
@@ -73,12 +74,12 @@ class Sheet:
         return self._spread[count, limit]
 
     def at(self, points: np.ndarray) -> np.ndarray:
-        """The point of the sheet nearest to each of `points` (m, 3)."""
+        """Find the point of the sheet nearest to each of `points` (m, 3)."""
         return self.tree.query(points)[1]
 
 
 def _neighbours(between: np.ndarray) -> np.ndarray:
-    """Pairs (E, 2) of points with distances (n, n) between them, each with the six nearest to it."""
+    """Return pairs (E, 2): each point with its six nearest, from distances (n, n)."""
     near = np.argsort(between, axis=1)[:, 1:7]
     i, j = np.repeat(np.arange(len(between)), near.shape[1]), near.ravel()
     linked = np.isfinite(between[i, j])
@@ -86,37 +87,40 @@ def _neighbours(between: np.ndarray) -> np.ndarray:
 
 
 def _symmetric(i: np.ndarray, j: np.ndarray, length: np.ndarray, count: int) -> csr_array:
+    """Build a symmetric matrix of edge lengths."""
     rows, columns = np.r_[i, j], np.r_[j, i]
     return csr_array(coo_array((np.maximum(np.r_[length, length], 1e-9), (rows, columns)), shape=(count, count)))
 
 
 def _join(points: np.ndarray, graph: csr_array, label: np.ndarray) -> csr_array:
-    """The graph with its larger pieces linked by the shortest straight bridges, as holes may part a body."""
+    """Link the larger components of a graph by straight bridges, as holes may separate parts of a body."""
+    # components of at least 20 points and 0.2% are worth a bridge; smaller ones are specks
     size = np.bincount(label)
     large = np.flatnonzero(size >= max(20, 0.002 * len(points)))
     if len(large) < 2:
         return graph
-    found = []
+    # the shortest bridge between each pair; a minimum spanning tree chooses which to use
+    bridges = []
     for k, a in enumerate(large):
-        mine = np.flatnonzero(label == a)
-        tree = cKDTree(points[mine])
+        own = np.flatnonzero(label == a)
+        tree = cKDTree(points[own])
         for b in large[k + 1:]:
             other = np.flatnonzero(label == b)
             distance, near = tree.query(points[other])
             best = int(distance.argmin())
-            found.append((k, int(np.flatnonzero(large == b)[0]), mine[near[best]], other[best], distance[best]))
-    ka, kb, i, j, length = (np.array(column) for column in zip(*found, strict=True))
+            bridges.append((k, int(np.flatnonzero(large == b)[0]), own[near[best]], other[best], distance[best]))
+    ka, kb, i, j, length = (np.array(column) for column in zip(*bridges, strict=True))
     chosen = spanning_tree(ka, kb, length + 1e-9, len(large)).tocoo()
     used = np.isin(ka * len(large) + kb, chosen.row * len(large) + chosen.col)
     return graph + _symmetric(i[used].astype(np.int64), j[used].astype(np.int64), length[used], len(points))
 
 
 def _orient(points: np.ndarray, normals: np.ndarray, reach: float) -> np.ndarray:
-    """Normals (n, 3) with signs that agree between neighbours and point outward on the whole."""
+    """Orient normals (n, 3) consistently between neighbours, and outward on the whole, over a minimum spanning tree."""
     i, j = cKDTree(points).query_pairs(reach, output_type="ndarray").T
     along = points[j] - points[i]
     along /= np.maximum(np.linalg.norm(along, axis=1, keepdims=True), 1e-12)
-    # Through a thin part normals agree up to sign too, but the way there runs along them.
+    # through a thin part normals agree up to sign too, but the edge runs along them: that costs more
     through = np.maximum(np.abs(np.einsum("nd,nd->n", normals[i], along)),
                          np.abs(np.einsum("nd,nd->n", normals[j], along)))
     cost = 1.001 - np.abs(np.einsum("nd,nd->n", normals[i], normals[j])) + 2 * through**2
@@ -124,6 +128,7 @@ def _orient(points: np.ndarray, normals: np.ndarray, reach: float) -> np.ndarray
     tree = spanning_tree(i, j, cost, n)
     tree = csr_array(tree + tree.T)
     normals, todo = normals.copy(), np.ones(n, dtype=bool)
+    # spread signs from the highest point of each component, then flip it if its normals point inward
     while todo.any():
         root = int(np.flatnonzero(todo)[points[todo, 2].argmax()])
         order, before = breadth_first_order(tree, root, directed=False)

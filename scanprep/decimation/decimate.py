@@ -1,4 +1,4 @@
-"""Fewer triangles for the same surface [QEM]."""
+"""Reduce the triangles of a mesh, keeping its surface [QEM]."""
 from __future__ import annotations
 
 from collections.abc import Callable
@@ -26,13 +26,18 @@ class DecimateConfig(Settings):
     ----------
     method : str
         "quadric": least-error collapses, small triangles where the surface bends [QEM]. "even": shortest edges
-        first, triangles of one size. "fast": the collapses of fast-simplification without those that break the
-        surface, quicker and rougher than "quadric". All three keep a closed manifold mesh closed and manifold.
+        first, triangles of equal size. "fast": the collapses of fast-simplification, without those that break the
+        surface; faster and rougher than "quadric". All three keep a closed manifold mesh closed and manifold.
         "open3d" and "pymeshlab" need these libraries.
     improve : bool
-        Flip edges and move vertices along the original surface for well-shaped triangles.
+        Flip edges and move vertices along the original surface, for well-shaped triangles.
     crease : float, radians, optional
-        Edges at which the surface bends by more stay edges; "quadric" only.
+        Edges where the surface bends by more are kept; "quadric" only.
+
+    Examples
+    --------
+    >>> DecimateConfig(improve=True).method
+    'quadric'
     """
 
     method: Annotated[Method, FLAG] = "quadric"
@@ -41,11 +46,11 @@ class DecimateConfig(Settings):
 
 
 class Decimation(NamedTuple):
-    """A mesh of fewer triangles, and what became of the original ones."""
+    """A decimated mesh, and its map to the original one."""
 
     mesh: Mesh
-    owner: np.ndarray           # (N,) the new vertex that stands for each original one
-    vertex_map: np.ndarray      # (n,) an original vertex of every new one: the one that collapses left over
+    owner: np.ndarray           # (N,) the new vertex of each original one
+    vertex_map: np.ndarray      # (n,) the original vertex of every new one: the survivor of its collapses
     face_map: np.ndarray        # (f,) the original triangle of every new one
 
 
@@ -56,27 +61,34 @@ def decimate(mesh: Mesh, faces: int, config: DecimateConfig | None = None, keep:
     Parameters
     ----------
     mesh : Mesh
-        Manifold, closed or with borders.
+        Manifold, closed or with borders; vertices in metres.
     faces : int
-        A mesh that has no more is returned as it is.
+        Number of triangles to reach. A mesh that has no more is returned unchanged.
     config : DecimateConfig, optional
+        Settings.
     keep : (n,) int, optional
-        Vertices that stay where they are; "quadric" only.
+        Vertices that stay in place; "quadric" only.
     labels : (F,) int, optional
-        Part of every triangle: borders between parts stay curves; "quadric" only.
-    progress : callback(done, total), optional
-        Triangles taken away, and how many have to be; "quadric" only.
+        Part of every triangle: borders between parts are preserved; "quadric" only.
+    progress : callable, optional
+        Called as progress(removed, total) with numbers of triangles; "quadric" only.
 
     Returns
     -------
     Mesh
-        A vertex has the mean colour of those that became it.
+        Vertices in metres. A vertex has the mean colour of those that collapsed into it.
 
     Raises
     ------
     ValueError
-        Fewer than 4 triangles wanted, an unknown method, a method that cannot keep what should stay, or a mesh that
+        Fewer than 4 triangles asked for, an unknown method, a method that cannot keep what should stay, or a mesh that
         is not manifold.
+
+    Examples
+    --------
+    >>> from scanprep.synthetic.people import SyntheticPerson
+    >>> decimate(SyntheticPerson().mesh, 500).faces.shape
+    (500, 3)
 
     [QEM] pair contraction
     """
@@ -93,6 +105,7 @@ def decimate(mesh: Mesh, faces: int, config: DecimateConfig | None = None, keep:
             if value is not None:
                 raise ValueError(f"{name}: the method {config.method!r} cannot keep them; expected 'quadric'")
         smaller = _by_library(mesh, faces, config.method)
+    # methods that drop colours take those of the nearest vertex
     if smaller.colors is None and mesh.colors is not None:
         nearest = cKDTree(mesh.vertices).query(smaller.vertices)[1]
         smaller = Mesh(smaller.vertices, smaller.faces, mesh.colors[nearest])
@@ -104,16 +117,17 @@ def decimate(mesh: Mesh, faces: int, config: DecimateConfig | None = None, keep:
 
 def collapse(mesh: Mesh, faces: int, crease: float | None = None, keep: np.ndarray | None = None,
              labels: np.ndarray | None = None, progress: Callable[[int, int], None] | None = None) -> Decimation:
-    """Like `decimate` with the method "quadric", and says what became of every vertex and triangle.
+    """Decimate with the method "quadric", and return the map of every vertex and triangle.
 
     [QEM] pair contraction
     """
     _check(mesh, faces)
-    centre = mesh.vertices.mean(axis=0)                       # quadrics lose digits far from the origin
+    centre = mesh.vertices.mean(axis=0)                       # far from the origin quadrics lose digits
     rounds = Rounds(mesh, (mesh.vertices - centre)[:, None], keep, labels, crease)
     rounds.run(faces, progress)
     kept, owner = rounds.renumber()
     vertices = rounds.points[kept, 0] + centre
+    # vertices that stay get their exact coordinates back
     same = rounds.kinds[kept] == FIXED
     vertices[same] = mesh.vertices[kept[same]]
     smaller = Mesh(vertices, owner[mesh.faces[rounds.face_rows]], _mean_colors(mesh, owner, len(kept)))
@@ -121,6 +135,7 @@ def collapse(mesh: Mesh, faces: int, crease: float | None = None, keep: np.ndarr
 
 
 def _check(mesh: Mesh, faces: int) -> None:
+    """Raise ValueError for fewer than 4 triangles or a mesh that is not manifold."""
     if faces < 4:
         raise ValueError(f"faces: expected at least 4, got {faces}")
     if not (mesh.is_edge_manifold and mesh.is_vertex_manifold):
@@ -128,7 +143,7 @@ def _check(mesh: Mesh, faces: int) -> None:
 
 
 def _mean_colors(mesh: Mesh, owner: np.ndarray, count: int) -> np.ndarray | None:
-    """Colours of new vertices: means over what collapsed into them, by area."""
+    """Average colours (n, 3) over the vertices that collapsed into each new one, weighted by area."""
     if mesh.colors is None:
         return None
     weight = mesh.vertex_areas + 1e-300
@@ -137,8 +152,9 @@ def _mean_colors(mesh: Mesh, owner: np.ndarray, count: int) -> np.ndarray | None
 
 
 def _by_library(mesh: Mesh, faces: int, method: Method) -> Mesh:
+    """Decimate with one of the library methods."""
     if method == "even":
-        # shortest edges collapse to their middles, which are then put back onto the surface
+        # shortest edges collapse to their midpoints, which are then projected onto the surface
         import igl
 
         vertices, triangles = igl.decimate(np.asfortranarray(mesh.vertices), np.asfortranarray(mesh.faces), faces)[:2]
@@ -151,59 +167,63 @@ def _by_library(mesh: Mesh, faces: int, method: Method) -> Mesh:
         mended = fast_collapses(mesh, faces)
         return mended if len(mended.faces) <= faces else collapse(mended, faces).mesh
     if method == "open3d":
-        pass
+        from ..adapters.open3d_filters import open3d_decimation as library_decimation
     else:
-        from ..adapters.pymeshlab_filters import meshlab_decimation
-    return meshlab_decimation(mesh, faces)
+        from ..adapters.pymeshlab_filters import meshlab_decimation as library_decimation
+    return library_decimation(mesh, faces)
 
 
 def fast_collapses(mesh: Mesh, faces: int) -> Mesh:
-    """Fewer triangles by the collapses that fast-simplification finds, in their order.
+    """Decimate by the collapses of fast-simplification, in their order.
 
-    Its collapses are not tested for what they do to the topology. The ones that leave the surface non-manifold are
-    taken back, last ones first, so that some triangles more than wanted may be left.
+    The library does not check topology. Collapses that make the surface non-manifold are undone, last ones first. So
+    some triangles more than wanted may remain.
 
     [QEM] pair contraction
     """
     import fast_simplification
 
-    vertices, triangles = np.array(mesh.vertices), np.array(mesh.faces)         # it wants to write
+    vertices, triangles = np.array(mesh.vertices), np.array(mesh.faces)         # the library needs writable arrays
     collapses = fast_simplification.simplify(vertices, triangles, target_count=faces, return_collapses=True)[2]
     centre = mesh.vertices.mean(axis=0)
     quadrics, areas = (x[:, 0] for x in surface_quadrics((mesh.vertices - centre)[:, None], mesh.faces, HOLD))
     undone = np.zeros(len(collapses), dtype=bool)
     while True:
+        # apply the collapses that are not undone, then place every vertex by its quadric
         owner = np.arange(len(mesh.vertices))
         owner[collapses[~undone, 1]] = collapses[~undone, 0]      # the second goes into the first
         kept, number = np.unique(final_owner(owner), return_inverse=True)
         corners = number[mesh.faces]
         whole = (corners != np.roll(corners, 1, axis=1)).all(axis=1)
-        left = Mesh(minimise_quadrics(sum_at(number[:, None], quadrics, len(kept))) + centre, corners[whole])
-        bad = _broken(left, sum_at(number[:, None], areas, len(kept)))
+        smaller = Mesh(minimise_quadrics(sum_at(number[:, None], quadrics, len(kept))) + centre, corners[whole])
+        # undo the latest collapse into every bad vertex, and try again
+        bad = _broken(smaller, sum_at(number[:, None], areas, len(kept)))
         last = np.full(len(kept), -1)
         rows = np.flatnonzero(~undone)
         last[number[collapses[rows, 0]]] = rows                   # in order: the last one written stays
         latest = last[bad]
         if not (latest >= 0).any():
-            return left
+            return smaller
         undone[latest[latest >= 0]] = True
 
 
-def _broken(left: Mesh, areas: np.ndarray) -> np.ndarray:
-    """(n,) bool: vertices where the surface is not manifold, is gone, or is inverted.
+def _broken(smaller: Mesh, areas: np.ndarray) -> np.ndarray:
+    """Find vertices (n,) bool where the surface is not manifold, missing, or inverted.
 
-    `areas` (n, 3) are the area vectors of what the vertices stand for.
+    `areas` (n, 3) are the summed area vectors of the original vertices of each.
     """
-    bad = np.ones(len(left.vertices), dtype=bool)
-    bad[left.faces] = False
-    half = np.sort(left.faces * len(bad) + np.roll(left.faces, -1, axis=1), axis=None)
+    bad = np.ones(len(smaller.vertices), dtype=bool)
+    bad[smaller.faces] = False
+    # directed edges that occur twice, vertices with several fans, duplicate triangles
+    half = np.sort(smaller.faces * len(bad) + np.roll(smaller.faces, -1, axis=1), axis=None)
     twice = half[1:][half[1:] == half[:-1]]
     bad[twice // len(bad)] = bad[twice % len(bad)] = True
-    bad[left.non_manifold_vertices] = True
-    corners = np.sort(left.faces, axis=1)
+    bad[smaller.non_manifold_vertices] = True
+    corners = np.sort(smaller.faces, axis=1)
     order = np.lexsort(corners.T)
     bad[corners[order[1:]][(corners[order[1:]] == corners[order[:-1]]).all(axis=1)]] = True
+    # triangles against the area vectors of their corners are inverted
     meant = areas / np.maximum(np.linalg.norm(areas, axis=1, keepdims=True), 1e-300)
-    inverted = np.einsum("fd,fd->f", left.face_normals, meant[left.faces].sum(axis=1)) < 0
-    bad[left.faces[inverted]] = True
+    inverted = np.einsum("fd,fd->f", smaller.face_normals, meant[smaller.faces].sum(axis=1)) < 0
+    bad[smaller.faces[inverted]] = True
     return bad

@@ -11,7 +11,8 @@ _ROW, _COLUMN = np.array([0, 0, 0, 1, 1, 2]), np.array([0, 1, 2, 1, 2, 2])
 
 
 def plane_quadrics(normals: np.ndarray, through: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    """Weighted squared distance (..., 10) to planes of unit normals (..., 3) through points (..., 3).
+    """Compute quadrics (..., 10): weighted squared distance to planes with unit normals (..., 3) through points (...,
+    3).
 
     [QEM] fundamental error quadric
     """
@@ -21,7 +22,7 @@ def plane_quadrics(normals: np.ndarray, through: np.ndarray, weights: np.ndarray
 
 
 def point_quadrics(points: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    """Weighted squared distance to points (..., 3): quadrics (..., 10) that have a minimum in any case."""
+    """Compute quadrics (..., 10): weighted squared distance to points (..., 3); they always have a unique minimum."""
     out = np.zeros((*points.shape[:-1], 10))
     out[..., [0, 3, 5]] = 1
     out[..., 6:9] = -points
@@ -30,23 +31,24 @@ def point_quadrics(points: np.ndarray, weights: np.ndarray) -> np.ndarray:
 
 
 def surface_quadrics(points: np.ndarray, faces: np.ndarray, hold: float) -> tuple[np.ndarray, np.ndarray]:
-    """Quadrics (N, M, 10) of vertices for the planes of the triangles around them, by area; area vectors (N, M, 3).
+    """Sum quadrics (N, M, 10) of the planes of the triangles around every vertex, by area; and area vectors (N, M, 3).
 
-    `hold` weighs the distance to the vertex itself beside that to the planes.
+    `hold` is the weight of the distance to the vertex itself against that to the planes.
     """
     corners = points[faces]
     cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]) / 2
     area = np.linalg.norm(cross, axis=-1)
     normal = cross / np.maximum(area, 1e-300)[..., None]
+    # 14 columns per triangle: quadric, area vector, area
     planes = np.concatenate([plane_quadrics(normal, corners[:, 0], area), cross, area[..., None]], axis=-1)
     total = sum_at(faces, planes, len(points))
     return total[..., :10] + point_quadrics(points, hold * total[..., 13]), total[..., 10:13]
 
 
 def curve_quadrics(points: np.ndarray, ends: np.ndarray, normals: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    """Quadrics (N, M, 10) of vertices for walls along curves, edges (E, 2), that are to stay where they are.
+    """Sum quadrics (N, M, 10) of walls along curves, edges (E, 2), which keep the curves in place.
 
-    The walls stand upright on the surface, of normals (E, M, 3), as high as their edges are long.
+    Walls are perpendicular to the surface with normals (E, M, 3), and as high as their edges are long.
 
     [QEM] boundary constraints
     """
@@ -58,7 +60,7 @@ def curve_quadrics(points: np.ndarray, ends: np.ndarray, normals: np.ndarray, we
 
 
 def sum_at(index: np.ndarray, values: np.ndarray, count: int) -> np.ndarray:
-    """What every row of values (n, ...) gives to each of its `index` (n, k), summed: (count, ...)."""
+    """Add every row of values (n, ...) to each of its targets `index` (n, k); return the sums (count, ...)."""
     flat = values.reshape(len(values), -1)
     out = np.empty((flat.shape[1], count))
     target = index.T.ravel()
@@ -68,7 +70,7 @@ def sum_at(index: np.ndarray, values: np.ndarray, count: int) -> np.ndarray:
 
 
 def value(Q: np.ndarray, x: np.ndarray) -> np.ndarray:
-    """Quadrics (..., 10) at points (..., 3)."""
+    """Evaluate quadrics (..., 10) at points (..., 3)."""
     x0, x1, x2 = x[..., 0], x[..., 1], x[..., 2]
     return (x0 * (Q[..., 0] * x0 + 2 * (Q[..., 1] * x1 + Q[..., 2] * x2 + Q[..., 6]))
             + x1 * (Q[..., 3] * x1 + 2 * (Q[..., 4] * x2 + Q[..., 7]))
@@ -76,10 +78,11 @@ def value(Q: np.ndarray, x: np.ndarray) -> np.ndarray:
 
 
 def minimise_quadrics(Q: np.ndarray) -> np.ndarray:
-    """The points (..., 3) where quadrics (..., 10) are least, which must be unique.
+    """Find the minima (..., 3) of quadrics (..., 10), which must be unique.
 
     [QEM] optimal placement
     """
+    # solve A x = -b by cofactors, which is faster than a general solver for 3 × 3
     xx, xy, xz, yy, yz, zz, bx, by, bz = (Q[..., i] for i in range(9))
     c0, c1, c2 = yy * zz - yz * yz, xz * yz - xy * zz, xy * yz - xz * yy
     det = xx * c0 + xy * c1 + xz * c2

@@ -1,4 +1,4 @@
-"""One decimation for a whole registered set: the same collapses on every mesh; and the folder of the smaller set."""
+"""Decimate a whole registered set by the same collapses on every mesh, and write the smaller set."""
 from __future__ import annotations
 
 import dataclasses
@@ -32,14 +32,14 @@ class DecimateSetConfig(Settings):
     Attributes
     ----------
     meshes : int
-        How many meshes, as different as possible, the cost of a collapse is summed over; 1 for the template alone.
+        Number of meshes, as different as possible, over which costs are summed; 1 for the template alone.
     placement : str
-        "vertices": every vertex of the small meshes is one of the large ones, so that the map of vertices is exact.
-        "solved": every mesh has its vertices where its own error is least, which is nearer to the surface by a third,
-        but a vertex slides a little along the skin from mesh to mesh, and the map only says which ones it stands for.
+        "vertices": every vertex of the small meshes is one of the large ones, so the vertex map is exact. "solved":
+        every mesh has its vertices where its own error is least. This is closer to the surface by a third, but vertices
+        slide a little along the skin between meshes, and the map is approximate.
     anchor : float
-        For "solved": weight of the distance to the vertices it stands for beside that to their planes; large lets
-        it slide less.
+        For "solved": weight of distances to the original vertices against distances to planes; larger means less
+        sliding.
     """
 
     meshes: Count = 8
@@ -49,20 +49,20 @@ class DecimateSetConfig(Settings):
 
 @dataclass(frozen=True, eq=False)
 class DecimatedSet:
-    """How meshes of one topology get fewer triangles."""
+    """A decimation that applies to all meshes of one topology."""
 
     template: Mesh
-    vertex_map: np.ndarray          # (n,) the original vertex of every one that was kept
-    owner: np.ndarray               # (N,) the new vertex that stands for each original one
-    face_map: np.ndarray            # (f,) the original triangle of every one that was kept
+    vertex_map: np.ndarray          # (n,) the original vertex of every new one
+    owner: np.ndarray               # (N,) the new vertex of each original one
+    face_map: np.ndarray            # (f,) the original triangle of every new one
     skeleton: Skeleton | None
     source: Mesh                    # the template before
     labels: np.ndarray | None       # (F,) parts of the triangles before
-    fixed: np.ndarray               # (n,) bool, new vertices that stay on the original one in any case
+    fixed: np.ndarray               # (n,) bool: new vertices that stay on the original one with any placement
     config: DecimateSetConfig
 
     def transfer(self, vertices: np.ndarray) -> np.ndarray:
-        """Vertices (..., n, 3) of small meshes for those (..., N, 3) of large ones, metres."""
+        """Map vertices (..., N, 3) of large meshes to those (..., n, 3) of small ones, metres."""
         vertices = np.asarray(vertices, dtype=np.float64)
         if vertices.shape[-2:] != self.source.vertices.shape:
             raise ValueError(f"vertices: expected shape (..., {len(self.source.vertices)}, 3), got {vertices.shape}")
@@ -75,11 +75,11 @@ class DecimatedSet:
         return kept
 
     def landmarks(self, vertices: Mapping[str, int]) -> dict[str, int]:
-        """New numbers of named vertices; of the vertex that stands for it where one was not kept."""
+        """Return the new numbers of named vertices; a vertex that was not kept gets its survivor."""
         return {name: int(self.owner[v]) for name, v in vertices.items()}
 
     def _solve(self, vertices: np.ndarray, curves: np.ndarray) -> np.ndarray:
-        """Vertices (n, 3) of one small mesh, each where the error of those it stands for is least."""
+        """Place the vertices (n, 3) of one small mesh, each where the error of those it replaces is least."""
         centre = vertices.mean(axis=0)
         points = (vertices - centre)[:, None]
         quadrics, areas = surface_quadrics(points, self.source.faces, self.config.anchor)
@@ -94,31 +94,34 @@ def decimate_set(template: Mesh, poses: np.ndarray | None, faces: int, config: D
                  progress: Progress | None = None) -> DecimatedSet:
     """Collapse edges of a template so that all meshes registered with it keep their shape.
 
-    What bends in any of them counts as curved. Borders, and borders of the skeleton's parts, stay curves.
+    A region that bends in any of them counts as curved. Borders, and borders of the skeleton's parts, are preserved.
 
     Parameters
     ----------
     template : Mesh
+        The common topology.
     poses : (M, N, 3) float, metres, or None
         Other meshes in its topology; None for the template alone.
     faces : int
-        How many triangles are wanted.
+        Number of triangles to reach.
     config : DecimateSetConfig, optional
+        Settings.
     keep : (k,) int, optional
         Vertices that stay, such as landmarks.
     skeleton : Skeleton, optional
-    progress : callback(done, total), optional
+        Parts whose borders are preserved.
+    progress : callable, optional
+        Called as progress(removed, total) with numbers of triangles.
 
     Returns
     -------
     DecimatedSet
-        With a template that has a triangle or two less than wanted, or more when no further edge can go without
-        harm.
+        Its template may have one or two triangles less than asked for, or more if no further edge can collapse.
 
     Raises
     ------
     ValueError
-        Not a template, meshes of other topology, vertices or a skeleton that are not of it.
+        An invalid template, meshes of another topology, or vertices or a skeleton that do not belong to it.
 
     [QEM] pair contraction
     """
@@ -133,6 +136,7 @@ def decimate_set(template: Mesh, poses: np.ndarray | None, faces: int, config: D
                          f"got {len(skeleton.part_of_face)}")
     keep = check_vertices(template, np.zeros(0) if keep is None else keep)
     labels = None if skeleton is None else skeleton.part_of_face
+    # costs are summed over the template and meshes unlike it; all checks are those of `decimate`
     points = _different_meshes(template, poses, config.meshes)
     rounds = Rounds(template, points.swapaxes(0, 1), keep, labels, onto_vertices=config.placement == "vertices")
     rounds.run(faces, progress)
@@ -141,7 +145,7 @@ def decimate_set(template: Mesh, poses: np.ndarray | None, faces: int, config: D
 
 
 def _different_meshes(template: Mesh, poses: np.ndarray | None, count: int) -> np.ndarray:
-    """(m, N, 3) the template and those meshes that are least like the ones before, placed as the template is."""
+    """Choose the template and the most different meshes (m, N, 3), aligned rigidly to the template."""
     centred = template.vertices - template.vertices.mean(axis=0)
     if poses is None or count == 1:
         return centred[None]
@@ -154,8 +158,8 @@ def _different_meshes(template: Mesh, poses: np.ndarray | None, count: int) -> n
 
 
 def _assemble(source: Mesh, skeleton: Skeleton | None, vertex_map: np.ndarray, owner: np.ndarray,
-               face_map: np.ndarray, fixed: np.ndarray, config: DecimateSetConfig) -> DecimatedSet:
-    """The result of `decimate_set` from its maps and the original template and skeleton."""
+              face_map: np.ndarray, fixed: np.ndarray, config: DecimateSetConfig) -> DecimatedSet:
+    """Build the result of `decimate_set` from its maps and the original template and skeleton."""
     labels = None if skeleton is None else skeleton.part_of_face
     small = Mesh(source.vertices[vertex_map], owner[source.faces[face_map]],
                  None if source.colors is None else source.colors[vertex_map])
@@ -166,7 +170,7 @@ def _assemble(source: Mesh, skeleton: Skeleton | None, vertex_map: np.ndarray, o
 
 
 def _smaller_skeleton(skeleton: Skeleton, face_map: np.ndarray, template: Mesh) -> Skeleton:
-    """The same parts and joints on fewer triangles; ValueError where a part lost all of its own."""
+    """Transfer parts and joints to fewer triangles; ValueError for a part without triangles."""
     parts = skeleton.part_of_face[face_map]
     lost = np.setdiff1d(np.arange(len(skeleton.parents)), parts)
     if len(lost):
@@ -182,9 +186,9 @@ def write_decimated_set(source: Path | str | RegisteredSet, folder: Path | str, 
                         config: DecimateSetConfig | None = None, progress: Progress | None = None) -> RegisteredSet:
     """Write a registered set with fewer triangles: template, meshes, skeleton, landmarks and the map.
 
-    Every file is written whole or not at all and the map first, so that a run that was interrupted goes on where
-    it was; meshes that are there are not written again. Landmarks in `landmarks.json` of the source stay on their
-    vertices. ValueError for a folder that is that of the source, or holds something else.
+    Files are written atomically, the map first, so that an interrupted run resumes. Existing meshes are not written
+    again. Landmarks in `landmarks.json` of the source keep their vertices. ValueError for the source's own folder, or a
+    folder with something else.
     """
     config = config or DecimateSetConfig()
     source = source if isinstance(source, RegisteredSet) else RegisteredSet.load(source)
@@ -194,15 +198,16 @@ def write_decimated_set(source: Path | str | RegisteredSet, folder: Path | str, 
     named = source.folder / "landmarks.json"
     landmarks = read_landmark_vertices(named, source.template) if named.exists() else {}
     settings = {"faces": faces, "config": dataclasses.asdict(config), "source": _fingerprint(source, landmarks)}
+    # resume from the stored map, or decimate and store it
     path = folder / "decimation.npz"
     if path.exists():
         done = _load_map(path, source, config, settings)
     elif (folder / "set.json").exists():
         raise ValueError(f"folder: {folder} holds a registered set that is no decimation")
     else:
-        step = max(-(-len(source.names) // 200), 1)        # among so many meshes the different ones are looked for
-        some = source.names[::step] if config.meshes > 1 else ()
-        done = decimate_set(source.template, source.vertices(some) if some else None, faces, config,
+        step = max(-(-len(source.names) // 200), 1)        # about 200 meshes are enough to choose from
+        sample = source.names[::step] if config.meshes > 1 else ()
+        done = decimate_set(source.template, source.vertices(sample) if sample else None, faces, config,
                             np.array(list(landmarks.values()), dtype=np.int64), source.skeleton)
         storage.save(path, KIND, VERSION, {name: getattr(done, name) for name in _MAPS}, settings)
     if landmarks:
@@ -212,6 +217,7 @@ def write_decimated_set(source: Path | str | RegisteredSet, folder: Path | str, 
     out = RegisteredSet.create(folder, done.template, info)
     if done.skeleton is not None:
         out = out.with_skeleton(done.skeleton)
+    # write the meshes that are not there yet
     for number, entry in enumerate(source.entries, 1):
         if entry.name not in out.names:
             out = out.add(entry.name, done.transfer(source.vertices([entry.name])[0]), entry.subject, entry.pose,
@@ -222,7 +228,7 @@ def write_decimated_set(source: Path | str | RegisteredSet, folder: Path | str, 
 
 
 def _fingerprint(source: RegisteredSet, landmarks: dict[str, int]) -> str:
-    """What a decimation depends on, apart from its settings and the meshes there were when it was made."""
+    """Hash what a decimation depends on, apart from its settings and the poses used."""
     parts = np.zeros(0, dtype=np.int64) if source.skeleton is None else source.skeleton.part_of_face
     kept = np.array(list(landmarks.values()), dtype=np.int64)
     digest = hashlib.sha256()
@@ -232,9 +238,10 @@ def _fingerprint(source: RegisteredSet, landmarks: dict[str, int]) -> str:
 
 
 def _load_map(path: Path, source: RegisteredSet, config: DecimateSetConfig, settings: dict[str, Any]) -> DecimatedSet:
+    """Load the stored map of a folder; ValueError if it belongs to another set or other settings."""
     header, arrays = storage.load(path, KIND, (VERSION,))
     if isinstance(header.get("config"), dict):
-        header["config"].pop("rounds", None)             # settings that older files hold and that are constants now
+        header["config"].pop("rounds", None)             # older files hold settings that are constants now
     if {key: header.get(key) for key in settings} != storage.as_json(settings):
         raise ValueError(f"{path}: the folder holds a decimation of another set or with other settings")
     with storage.taking_apart(path, "the maps between two templates"):

@@ -1,4 +1,4 @@
-"""What a depth camera saw: a picture of distances, cleaned of pixels between two surfaces, as points with normals."""
+"""Depth pictures: remove flying pixels, and convert to points with normals or a mesh."""
 from __future__ import annotations
 
 import io
@@ -11,15 +11,15 @@ from scipy import ndimage
 from ..geometry import storage
 from ..geometry.mesh import Mesh
 
-NOISE = 0.002                        # metres at one metre, growing with the square of the distance: what cameras have
-JUMP = 0.02                          # metres, and as much of the distance: neighbours farther apart are two surfaces
-SMOOTHED = 2                         # pixels around each from which its normal comes
+NOISE = 0.002                        # metres at one metre, times the squared distance; typical of depth cameras
+JUMP = 0.02                          # metres, or share of the distance: neighbours farther apart are different surfaces
+SMOOTHED = 2                         # normals are estimated from so many pixels on each side
 CAMERA = ".camera.json"              # ending of the file beside a picture
 
 
 @dataclass(frozen=True, eq=False)
 class DepthPicture:
-    """Distances along the optical axis, of a camera in the origin that looks along z, x to the right and y down.
+    """A picture of distances along the optical axis. The camera is at the origin and looks along z; x right, y down.
 
     Attributes
     ----------
@@ -27,6 +27,12 @@ class DepthPicture:
         NaN where nothing was measured.
     intrinsics : (3, 3) float, pixels
         Focal lengths on the diagonal, the optical centre in the last column.
+
+    Examples
+    --------
+    >>> picture = DepthPicture.of(np.full((8, 8), 1.5), np.array([[10, 0, 3.5], [0, 10, 3.5], [0, 0, 1]]))
+    >>> picture.points().shape
+    (8, 8, 3)
     """
 
     depth: np.ndarray
@@ -34,9 +40,10 @@ class DepthPicture:
 
     @staticmethod
     def of(depth: np.ndarray, intrinsics: np.ndarray) -> DepthPicture:
-        """A picture from numbers that may be zero, infinite or negative where nothing was measured.
+        """Make a picture from distances that are zero, infinite or negative where nothing was measured.
 
-        `depth` (h, w), metres; `intrinsics` (3, 3), pixels.
+        `depth` (h, w), metres; `intrinsics` (3, 3), pixels. ValueError for other shapes, and for depths that cannot be
+        metres.
         """
         depth, intrinsics = np.asarray(depth, dtype=np.float64), np.asarray(intrinsics, dtype=np.float64)
         if depth.ndim != 2 or min(depth.shape) < 8:
@@ -56,17 +63,17 @@ class DepthPicture:
         return np.isfinite(self.depth)
 
     def points(self) -> np.ndarray:
-        """(h, w, 3) metres; NaN where nothing was measured."""
+        """Return the points (h, w, 3), metres; NaN where nothing was measured."""
         row, column = pixels(self.depth.shape)
         return self.depth[..., None] * self.directions(column, row)
 
     def directions(self, column: np.ndarray, row: np.ndarray) -> np.ndarray:
-        """(..., 3) rays of pixels, one long along the optical axis."""
+        """Return the rays (..., 3) of pixels, with length one along the optical axis."""
         K = self.intrinsics
         return np.stack([(column - K[0, 2]) / K[0, 0], (row - K[1, 2]) / K[1, 1], np.ones(np.shape(column))], axis=-1)
 
     def project(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Row and column (...) of the pixels of points (..., 3), and whether they are in the picture."""
+        """Project points (..., 3), metres: row and column (...) of their pixels, and whether they are inside."""
         K, (h, w) = self.intrinsics, self.depth.shape
         ahead = points[..., 2] > 1e-6
         z = np.where(ahead, points[..., 2], 1.0)
@@ -76,13 +83,13 @@ class DepthPicture:
         return (np.where(inside, row, 0).astype(np.int64), np.where(inside, column, 0).astype(np.int64), inside)
 
     def jump(self) -> np.ndarray:
-        """(h, w) metres by which neighbours on one surface may differ."""
+        """Return by how much (h, w), metres, neighbours on one surface may differ."""
         return JUMP * np.maximum(np.nan_to_num(self.depth), 1.0)
 
     def without_flying_pixels(self) -> DepthPicture:
-        """The picture without pixels that hang between two surfaces, on neither.
+        """Remove flying pixels, which hang between two surfaces.
 
-        A pixel stays when at least half of its neighbours that were measured are about as far away.
+        A pixel stays if at least half of its eight neighbours are about as far away.
         """
         alike, there = np.zeros(self.depth.shape), np.zeros(self.depth.shape)
         padded, jump, (h, w) = np.pad(self.depth, 1, constant_values=np.nan), self.jump(), self.depth.shape
@@ -94,9 +101,9 @@ class DepthPicture:
         return replace(self, depth=np.where((alike - 1 >= 0.5 * 8) & (there > 4), self.depth, np.nan))
 
     def normals(self, smoothed: int = SMOOTHED) -> np.ndarray:
-        """(h, w, 3) unit, towards the camera, from planes of inverse depth over a few pixels; NaN where unknown.
+        """Estimate unit normals (h, w, 3) towards the camera by planes of inverse depth; NaN where unknown.
 
-        A plane of space is linear in inverse depth over the picture: 1/z = a·ray, and a is its normal.
+        A plane in space is linear in inverse depth over the picture: 1/z = a·ray, and a is its normal.
         """
         size = 2 * smoothed + 1
         row, column = pixels(self.depth.shape)
@@ -104,8 +111,10 @@ class DepthPicture:
         inverse = np.where(known, 1 / np.where(known, self.depth, 1.0), 0.0)
 
         def over(values: np.ndarray) -> np.ndarray:
+            """Average known values over the window."""
             return np.asarray(ndimage.uniform_filter(values * known, size, mode="constant"))
 
+        # normal equations of a per pixel, summed over a window by box filters; 40% of the window must have data
         A, b = np.zeros((*self.depth.shape, 3, 3)), np.zeros((*self.depth.shape, 3))
         for i in range(3):
             b[..., i] = over(rays[..., i] * inverse)
@@ -118,7 +127,7 @@ class DepthPicture:
         return out
 
     def mesh(self) -> Mesh:
-        """Triangles between neighbouring pixels on one surface, turned to the camera; ValueError without any."""
+        """Mesh neighbouring pixels on one surface, facing the camera; ValueError without any triangle."""
         number = np.arange(self.depth.size).reshape(self.depth.shape)
         a, b, c, d = number[:-1, :-1], number[:-1, 1:], number[1:, :-1], number[1:, 1:]
         faces = np.concatenate([np.stack([a, c, b], -1).reshape(-1, 3), np.stack([b, c, d], -1).reshape(-1, 3)])
@@ -131,13 +140,14 @@ class DepthPicture:
         return Mesh(self.points().reshape(-1, 3)[used], index.reshape(-1, 3))
 
     def halve(self) -> DepthPicture:
-        """Every second pixel of every second row, means of those around on the same surface."""
+        """Halve the resolution; each new pixel is the mean of those of its four that are on the nearest surface."""
         h, w = (n // 2 * 2 for n in self.depth.shape)
         blocks = self.depth[:h, :w].reshape(h // 2, 2, w // 2, 2).transpose(0, 2, 1, 3).reshape(h // 2, w // 2, 4)
         nearest = np.nanmin(np.where(np.isfinite(blocks), blocks, np.inf), axis=2)[..., None]
         near = np.isfinite(blocks) & (blocks - nearest < JUMP * np.maximum(nearest, 1.0))
         count = near.sum(axis=2)
         mean = np.where(near, blocks, 0).sum(axis=2) / np.maximum(count, 1)
+        # new pixel centres lie between old ones: (c - 0.5) / 2 = c / 2 - 0.25
         K = self.intrinsics.copy()
         K[:2] /= 2
         K[:2, 2] -= 0.25
@@ -145,31 +155,58 @@ class DepthPicture:
 
 
 def pixels(shape: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray]:
-    """Row and column (h, w) of every pixel."""
+    """Return row and column (h, w) of every pixel."""
     row, column = np.indices(shape)
     return np.asarray(row), np.asarray(column)
 
 
 def is_picture(path: Path) -> bool:
-    """Whether the name is that of a depth picture."""
+    """Test whether a file name is that of a depth picture."""
     return path.suffix.lower() == ".png"
 
 
 def is_camera(path: Path) -> bool:
-    """Whether the name is that of the camera of one."""
+    """Test whether a file name is that of a depth picture's camera."""
     return path.name.lower().endswith(CAMERA)
 
 
 def camera_file(picture: Path) -> Path:
-    """Where the camera of a picture is told."""
+    """Return the path of the camera file beside a picture."""
     return picture.with_name(picture.stem + CAMERA)
 
 
 def read_depth(path: Path, metres: float = 0.001) -> DepthPicture:
-    """A picture from a PNG file of 16 bits, 0 where nothing was measured, `metres` long each unit.
+    """Read a depth picture from a 16-bit PNG file.
 
-    The camera is read from `NAME.camera.json` beside it: `{"fx", "fy", "cx", "cy"}` in pixels, or what Open3D writes,
-    `{"intrinsic_matrix": [...]}`, column by column.
+    The camera is read from `NAME.camera.json` beside it: `{"fx", "fy", "cx", "cy"}` in pixels, or
+    `{"intrinsic_matrix": [...]}` column by column, as Open3D writes it.
+
+    Parameters
+    ----------
+    path : Path
+        PNG file with one channel of 16 bits, 0 where nothing was measured.
+    metres : float
+        Length of one unit of the file.
+
+    Returns
+    -------
+    DepthPicture
+        Depth (h, w), metres, and intrinsics (3, 3), pixels.
+
+    Raises
+    ------
+    ValueError
+        Another kind of file, no camera beside it, or depths that cannot be metres.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> from PIL import Image
+    >>> folder = Path(tempfile.mkdtemp())
+    >>> Image.fromarray(np.full((8, 8), 1500, dtype=np.uint16)).save(folder / "a.png")
+    >>> _ = (folder / "a.camera.json").write_text('{"fx": 10, "fy": 10, "cx": 3.5, "cy": 3.5}')
+    >>> float(read_depth(folder / "a.png").depth[0, 0])
+    1.5
     """
     values = read_distances(path)
     try:
@@ -179,7 +216,7 @@ def read_depth(path: Path, metres: float = 0.001) -> DepthPicture:
 
 
 def read_distances(path: Path) -> np.ndarray:
-    """(H, W) whole numbers of a PNG file, in its own unit; ValueError for another kind of picture."""
+    """Read distances (h, w) of a PNG file, in its own unit; ValueError for another kind of picture."""
     from PIL import Image, UnidentifiedImageError
 
     try:
@@ -193,15 +230,15 @@ def read_distances(path: Path) -> np.ndarray:
 
 
 def read_camera(path: Path) -> np.ndarray:
-    """Intrinsics (3, 3), pixels, from a JSON file."""
+    """Read intrinsics (3, 3), pixels, from a JSON file; ValueError where it is missing or incomplete."""
     if not path.exists():
         raise ValueError(f"expected its camera in {path}, as {{\"fx\": 589, \"fy\": 589, \"cx\": 319.5, "
                          "\"cy\": 239.5}, pixels; there is none")
     try:
-        told = storage.read_json(path, "the camera of a depth picture")
-        if "intrinsic_matrix" in told:
-            return np.array(told["intrinsic_matrix"], dtype=np.float64).reshape(3, 3).T
-        fx, fy, cx, cy = (float(told[name]) for name in ("fx", "fy", "cx", "cy"))
+        stored = storage.read_json(path, "the camera of a depth picture")
+        if "intrinsic_matrix" in stored:
+            return np.array(stored["intrinsic_matrix"], dtype=np.float64).reshape(3, 3).T
+        fx, fy, cx, cy = (float(stored[name]) for name in ("fx", "fy", "cx", "cy"))
     except (ValueError, KeyError, TypeError) as error:
         raise ValueError(f"{path}: expected fx, fy, cx and cy, or intrinsic_matrix ({error!r})") from None
     return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]])

@@ -1,8 +1,8 @@
-"""Files of meshes and points, with errors that say what is wrong.
+"""Read and write files of meshes and points, with errors that say what is wrong.
 
-Vertices keep the order of the file. Only along seams, where vertices are repeated for flat shading or textures and so
-cut the surface apart, equal places become one vertex, and a note says so. Coordinates become metres: most files do not
-say their unit, so the caller does or metres are assumed, with a warning where that would make a giant or a dwarf.
+Vertices keep the order of the file. Along seams, where vertices are repeated for flat shading or textures, equal
+positions are merged, with a warning. Coordinates become metres. Most files do not say their unit: the caller does, or
+metres are assumed, with a warning if that makes a giant or a dwarf.
 """
 from __future__ import annotations
 
@@ -49,17 +49,17 @@ __all__ = ["ENDINGS", "SCAN_ENDINGS", "UNITS", "EmptyFileError", "MeshFileError"
 Precision = Literal["double", "single"]
 
 
-# an ending has a letter and no space: `.05` and `.01 anna` belong to the name; some endings are two
+# an ending has a letter and no space: `.05` and `.01 anna` belong to the name; some endings are double
 _ENDING = re.compile(r"\.[0-9a-z]*[a-z][0-9a-z]*(\.gz)?$|\.(landmarks|mrk|betas)\.json$", re.IGNORECASE)
 
 
 def name_of(path: str | Path) -> str:
-    """What the thing in a file is called: the name of the file without its ending, all other dots kept.
+    """Return the name of a file without its ending; all other dots are kept.
 
     Parameters
     ----------
     path : str or Path
-        Of a scan, mesh, picture, landmark file ...; a packed one (`.ply.gz`) counts as what it holds.
+        Path of a scan, mesh, picture or landmark file; `.ply.gz` counts as one ending.
 
     Returns
     -------
@@ -75,11 +75,13 @@ def name_of(path: str | Path) -> str:
 
 
 class _Format(NamedTuple):
+    """How one file format is read and written."""
+
     read: Callable[[Path, bytes], Contents]
-    encode: Callable[[Contents, bool], bytes] | None = None     # with coordinates in double precision, or not
+    encode: Callable[[Contents, bool], bytes] | None = None     # (contents, double precision)
 
 
-# What is read here, by ending: a new format is a module and a line. `_MESHES` may hold triangles, `_POINTS` never do.
+# readers by ending: a new format needs a module and a line here; `_MESHES` may hold triangles, `_POINTS` never do
 _ROWS = _Format(format_text.read_xyz, format_text.encode_xyz)
 _MESHES = {".ply": _Format(format_ply.read, format_ply.encode),
            ".obj": _Format(format_text.read_obj, format_text.encode_obj),
@@ -100,37 +102,43 @@ SCAN_ENDINGS = tuple(ending for ending in ENDINGS if ending not in (".txt", ".cs
 
 
 def ending_of(path: str | Path) -> str:
-    """The ending of a name in small letters, that of what is packed in `.ply.gz`; empty where there is none."""
+    """Return the ending of a name in lower case, without `.gz`; empty if there is none."""
     path = Path(path)
     return (Path(path.stem) if path.suffix.lower() == ".gz" and Path(path.stem).suffix else path).suffix.lower()
 
 
 def read_mesh(path: str | Path, unit: str | None = None) -> Mesh:
-    """Read a triangle mesh; polygons are cut into triangles.
+    """Read a triangle mesh; polygons are triangulated.
 
     Parameters
     ----------
     path : str or Path
-        PLY, OBJ, STL, OFF, GLB, glTF, COLLADA (`.dae`), 3MF or Draco (`.drc`), also packed as `.ply.gz`; through
-        pymeshlab 3DS, X3D, WRL and CTM.
+        PLY, OBJ, STL, OFF, GLB, glTF, COLLADA (`.dae`), 3MF or Draco (`.drc`), also packed as `.ply.gz`. With
+        pymeshlab also 3DS, X3D, WRL and CTM.
     unit : 'm', 'mm', 'cm' or 'in', optional
-        Unit of the file. When it is not given: that which the file names, or the one other than metres in which the
-        mesh is as large as a person, with a UserWarning; else metres, with one where it would be larger than 10 m or
-        smaller than 0.1 m.
+        Unit of the file. By default the unit that the file names. Else the unit in which the mesh is as large as a
+        person, with a UserWarning. Else metres, with a UserWarning above 10 m or below 0.1 m.
 
     Returns
     -------
     Mesh
-        In metres. From STL, which has no vertices of its own, equal corners make one vertex. In other formats the
-        borders that run through the very same places are closed: a vertex that is repeated there becomes the first
-        of its place, with the mean of their colours, and `of_file` tells which. Vertices that are not finite are left
-        out with their triangles. Other vertices stay as they are. A UserWarning says so, and names the objects of a
-        file that holds several.
+        Vertices (N, 3), metres. A UserWarning reports each of these changes. Corners of an STL file at the same
+        position become one vertex. Vertices repeated along seams are merged into the first one, with the mean of their
+        colours; `of_file` maps the numbers. Vertices that are not finite are dropped with their triangles. Several
+        objects become one mesh.
 
     Raises
     ------
     MeshFileError
-        Missing, truncated or of another format, no triangles, a face that refers to a vertex that is not there.
+        A missing or truncated file, another format, no triangles, or a face with a vertex that does not exist.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> path = Path(tempfile.mkdtemp()) / "triangle.ply"
+    >>> write_mesh(path, Mesh([[0, 0, 0], [1, 0, 0], [0, 1, 0]], [[0, 1, 2]]))
+    >>> read_mesh(path, unit="m").vertices.shape
+    (3, 3)
     """
     path = Path(path)
     contents = _read(path)
@@ -140,11 +148,12 @@ def read_mesh(path: str | Path, unit: str | None = None) -> Mesh:
 
 
 def _has_faces(contents: Contents) -> bool:
+    """Test whether a file has triangles."""
     return contents.faces is not None and len(contents.faces) > 0
 
 
 def _mesh(path: Path, contents: Contents, unit: str | None) -> Mesh:
-    """The mesh of a file, in metres and with its seams closed."""
+    """Make the mesh of a file, in metres and with its seams closed."""
     assert contents.faces is not None, "only files with triangles are meshes"
     try:
         mesh = Mesh(contents.vertices, contents.faces, contents.colors, contents.of_file)
@@ -152,15 +161,15 @@ def _mesh(path: Path, contents: Contents, unit: str | None) -> Mesh:
         raise MeshFileError(f"{path}: {error}") from None
     mesh = _seamless(path, mesh)
     if len(contents.objects) > 1:
-        told = ", ".join(f"{name} ({number_of(count, 'triangle')})" for name, count in contents.objects[:6])
+        listed = ", ".join(f"{name} ({number_of(count, 'triangle')})" for name, count in contents.objects[:6])
         more = ", ..." if len(contents.objects) > 6 else ""
-        warnings.warn(f"{path}: {len(contents.objects)} objects were taken for one mesh: {told}{more}", stacklevel=2)
+        warnings.warn(f"{path}: {len(contents.objects)} objects were taken for one mesh: {listed}{more}", stacklevel=2)
     scale = metres_per_unit(path, mesh.vertices, unit, named=contents.metres)
     return mesh if scale == 1 else mesh.with_vertices(scale * mesh.vertices)
 
 
 def _seamless(path: Path, mesh: Mesh) -> Mesh:
-    """The mesh with its seams closed, if it has any."""
+    """Close the seams of a mesh, with a warning; return it as it is if it has none."""
     vertex_of = seams_closed(mesh.vertices, mesh.faces)
     if vertex_of is None:
         return mesh
@@ -168,7 +177,7 @@ def _seamless(path: Path, mesh: Mesh) -> Mesh:
     colors = None if mesh.colors is None else mean_of_merged(mesh.colors, vertex_of)
     warnings.warn(f"{path}: {len(vertex_of) - len(first)} of {len(vertex_of)} vertices repeat others along seams "
                   "(flat shading or textures) and were merged with them", stacklevel=3)
-    if mesh.of_file is not None:             # -1 of what was left out before
+    if mesh.of_file is not None:             # -1: left out before
         vertex_of_file = np.where(mesh.of_file < 0, -1, vertex_of[mesh.of_file])
     else:
         vertex_of_file = vertex_of
@@ -176,28 +185,37 @@ def _seamless(path: Path, mesh: Mesh) -> Mesh:
 
 
 def write_mesh(path: str | Path, mesh: Mesh, precision: Precision = "double") -> None:
-    """Write a mesh in metres, whole or not at all, in the format its name ends in.
+    """Write a mesh in metres, atomically, in the format of the file's ending.
 
     Parameters
     ----------
     path : str or Path
         `.ply` (binary), `.ply.gz`, `.obj`, `.stl`, `.off` or `.glb`.
     mesh : Mesh
+        The mesh, metres; colours are written where the format has them.
     precision : 'double' or 'single'
-        Of the coordinates: with 'double' a PLY file gives back the very same numbers. STL and GLB hold single
-        precision whatever is said here, a tenth of a micrometre at the size of a person.
+        Precision of the coordinates. A 'double' PLY file returns exactly the same numbers. STL and GLB always have
+        single precision, a tenth of a micrometre at the size of a person.
 
     Raises
     ------
     MeshFileError
-        A name that ends in no known format.
+        An ending of no known format.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> path = Path(tempfile.mkdtemp()) / "triangle.obj"
+    >>> write_mesh(path, Mesh([[0, 0, 0], [1, 0, 0], [0, 1, 0]], [[0, 1, 2]]))
+    >>> path.exists()
+    True
     """
     _write(Path(path), Contents(mesh.vertices, mesh.faces, None, mesh.colors), precision, _MESHES)
 
 
 @dataclass(frozen=True, eq=False)
 class PointCloud:
-    """Points of a surface."""
+    """Points of a surface, with normals and colours if known."""
 
     points: np.ndarray                      # (n, 3), metres
     normals: np.ndarray | None = None       # (n, 3), unit
@@ -210,7 +228,7 @@ def read_points(path: str | Path, unit: str | None = None) -> PointCloud:
     Parameters
     ----------
     path : str or Path
-        PLY, PCD, text (`.xyz`, `.txt`, `.pts`, `.asc`, `.csv`), through pymeshlab E57 and PTX, or any format of
+        PLY, PCD, text (`.xyz`, `.txt`, `.pts`, `.asc`, `.csv`), with pymeshlab E57 and PTX, or any format of
         `read_mesh`.
     unit : 'm', 'mm', 'cm' or 'in', optional
         As for `read_mesh`.
@@ -218,20 +236,28 @@ def read_points(path: str | Path, unit: str | None = None) -> PointCloud:
     Returns
     -------
     PointCloud
-        Normals are those of the file, zero where they are not finite, or of the triangles where there are triangles.
-        Points that are not finite are left out, with a UserWarning.
+        Points (n, 3), metres. Normals (n, 3) are those of the file, zero where they are not finite, else those of the
+        triangles if there are any. Points that are not finite are dropped, with a UserWarning.
 
     Raises
     ------
     MeshFileError
-        Missing, truncated or of another format, no points.
+        A missing or truncated file, another format, or no points.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> path = Path(tempfile.mkdtemp()) / "cloud.xyz"
+    >>> _ = path.write_text("0 0 0\\n0.5 0 0\\n0 1.7 0\\n")
+    >>> read_points(path, unit="m").points.shape
+    (3, 3)
     """
     path = Path(path)
     return _cloud(path, _read(path), unit)
 
 
 def _cloud(path: Path, contents: Contents, unit: str | None) -> PointCloud:
-    """The points of a file in metres, with unit normals where the file has some or there are triangles."""
+    """Make the points of a file in metres, with normals from the file or its triangles."""
     points = metres_per_unit(path, contents.vertices, unit, named=contents.metres) * contents.vertices
     normals = contents.normals
     if normals is not None:
@@ -242,37 +268,38 @@ def _cloud(path: Path, contents: Contents, unit: str | None) -> PointCloud:
 
 
 def read_scan_mesh(path: str | Path, unit: str | None = None) -> Mesh:
-    """A mesh as a scan: thinned where it is finer than any work needs, its triangles made sound; both are told."""
+    """Read a mesh as a scan: very fine scans are thinned and bad triangles repaired, both with a warning."""
     return _sound(Path(path), read_mesh(path, unit))
 
 
 def _sound(path: Path, mesh: Mesh) -> Mesh:
+    """Thin a very fine scan and repair its triangles."""
     return sanitise(thin_scan(mesh, str(path)), str(path))
 
 
 def read_view(path: str | Path, unit: str | None = None) -> Mesh | PointCloud:
-    """A scan as `read_scan_mesh`, or the points of a file without triangles with the normals and colours it has."""
+    """Read a scan as `read_scan_mesh` does, or the points of a file without triangles, with normals and colours."""
     path = Path(path)
     contents = _read(path)
     return _sound(path, _mesh(path, contents, unit)) if _has_faces(contents) else _cloud(path, contents, unit)
 
 
 def read_scan(path: str | Path, unit: str | None = None) -> Mesh | np.ndarray:
-    """A scan as `read_scan_mesh`, or as points (n, 3) where the file has no triangles."""
+    """Read a scan as `read_scan_mesh` does, or points (n, 3), metres, of a file without triangles."""
     view = read_view(path, unit)
     return view if isinstance(view, Mesh) else view.points
 
 
 def common_unit(paths: Sequence[Path], unit: str | None = None) -> str | None:
-    """One unit for files that belong together, as views, frames or registered meshes do.
+    """Find one unit for files that belong together, such as views, frames or registered meshes.
 
-    That given, else that of the first file that can be read, where it tells one (`likely_unit`), with a UserWarning.
-    A smaller part of a person, or a child, is then in the unit of the others.
+    The given unit, else that of the first readable file if it is not metres (`guess_unit`), with a UserWarning. So a
+    view of a smaller part, or a child, gets the unit of the others.
     """
     for path in () if unit is not None else paths:
         try:
             points = read_points(path, unit="m").points
-        except MeshFileError:                # whoever reads it says so
+        except MeshFileError:                # reported when the file is read
             continue
         scale = metres_per_unit(path, points, None)
         return next((name for name in UNITS if UNITS[name] == scale), None) if scale != 1 else None
@@ -280,38 +307,38 @@ def common_unit(paths: Sequence[Path], unit: str | None = None) -> str | None:
 
 
 def write_points(path: str | Path, cloud: PointCloud) -> None:
-    """Write points in metres, whole or not at all: `.ply`, `.ply.gz`, `.pcd`, `.xyz`, `.txt` or `.pts`."""
+    """Write points in metres, atomically: `.ply`, `.ply.gz`, `.pcd`, `.xyz`, `.txt` or `.pts`."""
     contents = Contents(cloud.points, None, cloud.normals, cloud.colors)
     _write(Path(path), contents, "double", {".ply": _MESHES[".ply"], **_POINTS})
 
 
 def is_scan(path: Path) -> bool:
-    """Whether a name is that of a mesh or a point cloud."""
+    """Test whether a name is that of a mesh or a point cloud."""
     return ending_of(path) in SCAN_ENDINGS
 
 
 def list_meshes(folder: str | Path) -> list[Path]:
-    """The mesh files of a folder, sorted by name, at least one; of a RegisteredSet those in its `meshes`."""
+    """List the mesh files of a folder or RegisteredSet, sorted by name; MeshFileError if there is none."""
     inside = Path(folder) / "meshes" if (Path(folder) / "set.json").is_file() else Path(folder)
     return list_files(inside, lambda path: ending_of(path) in _MESHES, f"meshes ({', '.join(_MESHES)})")
 
 
 def list_files(folder: Path, wanted: Callable[[Path], bool], least_one_of: str = "") -> list[Path]:
-    """The files of a folder that are wanted, sorted by name; hidden ones never are.
+    """List the wanted files of a folder, sorted by name, without hidden ones.
 
-    MeshFileError for what is no folder, and where none is found of what `least_one_of` names.
+    MeshFileError for a path that is no folder, and for an empty list if `least_one_of` names what is expected.
     """
     if not folder.is_dir():
         problem = "expected a folder, found a file" if folder.exists() else "no such folder"
         raise MeshFileError(f"{folder}: {problem}")
-    found = sorted(p for p in folder.iterdir() if p.is_file() and not p.name.startswith(".") and wanted(p))
-    if least_one_of and not found:
+    files = sorted(p for p in folder.iterdir() if p.is_file() and not p.name.startswith(".") and wanted(p))
+    if least_one_of and not files:
         raise MeshFileError(f"{folder}: expected {least_one_of}, found none")
-    return found
+    return files
 
 
 class Registered(NamedTuple):
-    """Meshes that share their triangles."""
+    """Meshes with shared triangles."""
 
     faces: np.ndarray           # (F, 3)
     vertices: np.ndarray        # (M, N, 3), metres
@@ -319,7 +346,7 @@ class Registered(NamedTuple):
 
 
 def read_registered(folder: str | Path, unit: str | None = None) -> Registered:
-    """Every mesh of a folder, or of a RegisteredSet, sorted by name; MeshFileError where one has other triangles."""
+    """Read all meshes of a folder or RegisteredSet, sorted by name; MeshFileError for different triangles."""
     paths = list_meshes(folder)
     unit, meshes = common_unit(paths, unit), []
     for path in paths:
@@ -330,10 +357,10 @@ def read_registered(folder: str | Path, unit: str | None = None) -> Registered:
 
 
 def check_same_topology(path: Path, mesh: Mesh, first_path: Path, first: Mesh) -> None:
-    """Raise MeshFileError where a mesh does not have the triangles of the first one, saying how they differ."""
-    mine, theirs = (f"{len(m.vertices)} vertices and {len(m.faces)} faces" for m in (mesh, first))
-    if mine != theirs:
-        raise MeshFileError(f"{path}: expected the topology of {first_path.name}, {theirs}; found {mine}")
+    """Raise MeshFileError if a mesh does not have the triangles of the first one, and say how they differ."""
+    counts, expected = (f"{len(m.vertices)} vertices and {len(m.faces)} faces" for m in (mesh, first))
+    if counts != expected:
+        raise MeshFileError(f"{path}: expected the topology of {first_path.name}, {expected}; found {counts}")
     if not np.array_equal(mesh.faces, first.faces):
         k = int(np.flatnonzero((mesh.faces != first.faces).any(axis=1))[0])
         raise MeshFileError(f"{path}: expected the faces of {first_path.name} in their order; there are as many, "
@@ -342,10 +369,10 @@ def check_same_topology(path: Path, mesh: Mesh, first_path: Path, first: Mesh) -
 
 
 def _read(path: Path) -> Contents:
-    """What a file of any format holds, without what is not finite."""
+    """Read a file of any format, without values that are not finite."""
     storage.check_regular(path, MeshFileError)
     ending = ending_of(path)
-    if ending not in _FORMATS:           # also of a file that holds nothing
+    if ending not in _FORMATS:           # checked before the contents, which may be empty
         raise MeshFileError(f"{path}: expected a name ending in {', '.join(ENDINGS)}, found {ending or 'none'!r}"
                             f"{format_foreign.advice(ending)}")
     contents = _FORMATS[ending].read(path, load_bytes(path))
@@ -357,7 +384,7 @@ def _read(path: Path) -> Contents:
 
 
 def _finite(path: Path, contents: Contents) -> Contents:
-    """Without the points that are not finite and their triangles, and without colours where one is not finite."""
+    """Drop points that are not finite with their triangles, and all colours if one is not finite; with a warning."""
     if contents.colors is not None and not np.isfinite(contents.colors).all():
         warnings.warn(f"{path}: colours that are not finite numbers; all colours were left out", stacklevel=2)
         contents = replace(contents, colors=None)
@@ -379,6 +406,7 @@ def _finite(path: Path, contents: Contents) -> Contents:
 
 
 def _write(path: Path, contents: Contents, precision: Precision, formats: dict[str, _Format]) -> None:
+    """Write a file in the format of its ending, packed if it ends in `.gz`."""
     if precision not in ("double", "single"):
         raise ValueError(f"precision: expected 'double' or 'single', got {precision!r}")
     writers = {ending: one.encode for ending, one in formats.items() if one.encode is not None}

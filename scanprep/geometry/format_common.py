@@ -1,4 +1,4 @@
-"""What the readers of all formats share: the error, the contents of a file, polygons and tables of numbers."""
+"""Shared by the readers of all formats: errors, contents of a file, polygons, tables of numbers, colours and units."""
 from __future__ import annotations
 
 import contextlib
@@ -14,18 +14,18 @@ import numpy as np
 from ..words import number_of
 from . import storage
 
-FARTHEST = 1e9                       # of a coordinate, in whatever unit
+FARTHEST = 1e9                       # largest coordinate in any unit; beyond it squares lose all digits
 UNITS = {"m": 1.0, "mm": 1e-3, "cm": 1e-2, "in": 0.0254}
 _SPELLED = {"metres": "m", "meters": "m", "millimetres": "mm", "millimeters": "mm", "centimetres": "cm",
             "centimeters": "cm", "inches": "in"}
 
 
 class MeshFileError(storage.StorageError):
-    """A file of a mesh, points or landmarks that cannot be read: which one, what was expected, what came."""
+    """A file of a mesh, points or landmarks cannot be read; names the file, what was expected and what came."""
 
 
 class EmptyFileError(MeshFileError):
-    """A file without a single vertex: of a camera, that it saw nothing."""
+    """A file without any vertex; from a camera it means that nothing was seen."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,12 +37,12 @@ class Contents:
     normals: np.ndarray | None = None       # (N, 3)
     colors: np.ndarray | None = None        # (N, 3) in [0, 1]
     objects: tuple[tuple[str, int], ...] = ()       # name and triangles of each, where the format has objects
-    of_file: np.ndarray | None = None       # (M,) which vertex each of the file is here, -1 of one that was left out
-    metres: float = 1.0                     # of the unit that the file names
+    of_file: np.ndarray | None = None       # (M,) number of each vertex of the file here, -1 if left out
+    metres: float = 1.0                     # length of the file's unit, if it names one
 
 
 def load_bytes(path: Path) -> bytes:
-    """The whole file, unpacked when its name ends in `.gz`; MeshFileError for one that is missing, damaged or empty."""
+    """Read a whole file, unpacked if it ends in `.gz`; MeshFileError if it is missing, damaged or empty."""
     data = storage.read_bytes(path, error=MeshFileError)
     if path.suffix.lower() == ".gz":
         data = _unpack(path, data)
@@ -52,12 +52,13 @@ def load_bytes(path: Path) -> bytes:
 
 
 def _unpack(path: Path, data: bytes) -> bytes:
-    """What a gzip file holds, up to far more than any mesh can be packed."""
+    """Unpack a gzip file, up to a limit that no real mesh reaches."""
+    # 1 MB plus 50 times the packed size: beyond that it is a decompression bomb
     most = 2**20 + 50 * len(data)
     try:
         with gzip.GzipFile(fileobj=io.BytesIO(data)) as packed:
             out = packed.read(most + 1)
-    except Exception as error:                   # gzip lets errors of zlib and of struct through
+    except Exception as error:                   # gzip also raises errors of zlib and struct
         raise MeshFileError(f"{path}: truncated or damaged gzip file ({error})") from None
     if len(out) > most:
         raise MeshFileError(f"{path}: expected a packed mesh, found {len(data)} bytes that unpack to more than {most}")
@@ -65,7 +66,7 @@ def _unpack(path: Path, data: bytes) -> bytes:
 
 
 def as_utf8(data: bytes) -> bytes:
-    """Text that begins with a mark of its encoding as UTF-8 without it; anything else as it is."""
+    """Convert text with a byte order mark to UTF-8 without it; return anything else as it is."""
     if data[:2] in storage.UTF_16:
         with contextlib.suppress(UnicodeDecodeError):
             return data.decode("utf-16").encode()
@@ -73,7 +74,7 @@ def as_utf8(data: bytes) -> bytes:
 
 
 def check_extent(path: Path, what: str, points: np.ndarray) -> None:
-    """MeshFileError for coordinates that no scan has, and that have no squares, lengths and areas."""
+    """Raise MeshFileError for coordinates that are too large for lengths and areas to be computed."""
     far = np.flatnonzero((np.abs(points) > FARTHEST).any(axis=1) & np.isfinite(points).all(axis=1))
     if len(far):
         raise MeshFileError(f"{path}: {what} {far[0]} lies at {points[far[0]].tolist()}, "
@@ -81,7 +82,7 @@ def check_extent(path: Path, what: str, points: np.ndarray) -> None:
 
 
 def unit_named(text: str) -> str | None:
-    """The key of `UNITS` that a file means, which may spell it out, cut it short or end it with a dot; or None.
+    """Find the key of `UNITS` that a file means; it may be spelt out, cut short or end with a dot. None if unknown.
 
     Examples
     --------
@@ -89,13 +90,13 @@ def unit_named(text: str) -> str | None:
     ('mm', 'm', None)
     """
     word = text.strip(" .[]()\0").lower()
-    # letters that tell a word: some programs keep no more of each
+    # four letters are enough: some programs cut the word there
     whole = (unit for full, unit in _SPELLED.items() if len(word) >= 4 and full.startswith(word))
     return word if word in UNITS else next(whole, None)
 
 
 def metres_of(unit: str | None) -> float:
-    """How many metres a unit is that a user names, one where none is named; ValueError for another word."""
+    """Return the length of a unit in metres, 1 without a unit; ValueError for an unknown one."""
     unit = "m" if unit is None else unit
     if unit not in UNITS:
         raise ValueError(f"unit: expected one of {', '.join(UNITS)}, got {unit!r}")
@@ -103,20 +104,19 @@ def metres_of(unit: str | None) -> float:
 
 
 def guess_unit(extent: float) -> str | None:
-    """The unit in which `extent` is that of a person, other than metres; None where none is or several may be."""
-    person = 1.3, 2.3  # metres: half-grown to arms stretched out; 51 to 91 are inches, 130 to 230 cm
+    """Guess the unit, other than metres, in which `extent` is that of a person; None if none or several fit."""
+    person = 1.3, 2.3  # metres: from a half-grown child to stretched arms; 51 to 91 are inches, 130 to 230 cm
     likely = [unit for unit in ("mm", "cm", "in") if person[0] <= extent * UNITS[unit] <= person[1]]
     return likely[0] if len(likely) == 1 else None
 
 
 def metres_per_unit(path: Path, points: np.ndarray, unit: str | None, smallest: float = 0.1, named: float = 1.0
                     ) -> float:
-    """What to multiply the coordinates of a file with to have metres.
+    """Find the factor from the unit of a file to metres.
 
-    Where no unit is given it is that which the file names, `named` metres, with a warning. Where that is metres and the
-    points span as much as a person in another one, it is that one. Else they are metres, with a warning where they
-    would span more than 10 m or less than `smallest`. Only how far the points span counts, not how far from the origin
-    they lie.
+    By default it is the unit that the file names, `named` metres, with a warning. If that is metres, but the points
+    span as much as a person in another unit, it is that unit. Else it is metres, with a warning if the points span more
+    than 10 m or less than `smallest`. Only the extent of the points counts, not their position.
     """
     if unit is not None:
         return metres_of(unit)
@@ -124,13 +124,14 @@ def metres_per_unit(path: Path, points: np.ndarray, unit: str | None, smallest: 
         warnings.warn(f"{path}: the file says that its unit is {named:g} m", stacklevel=3)
         return named
     extent = float(np.ptp(points, axis=0).max()) if len(points) else 0.0
-    if extent > 10:                          # 65.535 m is what many a depth camera writes where it saw nothing
+    if extent > 10:                          # many depth cameras write 65.535 m for missing points
         inner = float(np.ptp(np.quantile(points, [0.05, 0.95], axis=0), axis=0).max())
-        # of the extent: where nine points in ten span less, the others are no body
+        # if nine points in ten span less than a tenth, the others are no body
         if inner < 0.1 * extent:
             warnings.warn(f"{path}: a few points lie far off the rest, which spans {inner:.3g} m and alone tells the "
                           "unit; scape prep clean drops them", stacklevel=3)
             extent = inner
+    # another unit in which it is a person; else metres, with a warning for a giant or a dwarf
     likely = guess_unit(extent)
     if likely is not None:
         warnings.warn(f"{path}: read with unit='{likely}', in which it is {extent * UNITS[likely]:.2f} m from end to "
@@ -147,13 +148,13 @@ def metres_per_unit(path: Path, points: np.ndarray, unit: str | None, smallest: 
 
 
 def quote(text: bytes | str) -> str:
-    """The beginning of a piece of a file, fit for one line of an error."""
+    """Quote the first 40 characters of a piece of a file, for an error message."""
     shown = text if isinstance(text, str) else text.decode("latin-1")
     return repr(shown if len(shown) <= 40 else shown[:40] + "...")
 
 
 class Lines:
-    """The lines of a text file that hold something, with their numbers from `first` on; without comments."""
+    """The non-empty lines of a text file with their numbers from `first` on, without comments."""
 
     def __init__(self, path: Path, data: bytes, first: int = 1, comment: bytes | None = None) -> None:
         self.path = path
@@ -169,14 +170,14 @@ class Lines:
         return len(self.text)
 
     def fail(self, row: int, expected: str) -> MeshFileError:
-        """The error for a row that is not as expected; past the last row: the file is truncated."""
+        """Make the error for a row that is not as expected; past the last row the file is truncated."""
         if row >= len(self.text):
             return MeshFileError(f"{self.path}: truncated: expected {expected}, found the end of the file")
         return MeshFileError(f"{self.path}: line {self.numbers[row]}: expected {expected}, "
                              f"found {quote(self.text[row].strip())}")
 
     def table(self, rows: range, expected: str, columns: int, dtype: type = np.float64) -> np.ndarray:
-        """Numbers (rows, at least `columns`) of rows that all have equally many, or the error of the first bad one."""
+        """Read numbers (rows, at least `columns`) of equally long rows; else raise the error of the first bad row."""
         if not rows:
             return np.zeros((0, columns), dtype=dtype)
         if rows.stop <= len(self.text):
@@ -184,6 +185,7 @@ class Lines:
                 values: np.ndarray = np.loadtxt(self.text[rows.start:rows.stop], dtype=dtype, ndmin=2, comments=None)
                 if values.shape[1] >= columns:
                     return values
+        # the fast reader failed: find the first bad row, for the message
         width = None
         for row in rows:
             words = self.text[row].split() if row < len(self.text) else []
@@ -198,35 +200,37 @@ class Lines:
 
 def polygons(path: Path, sizes: np.ndarray, corners: np.ndarray, count: int,
              numbers: Sequence[int] | None = None, vertices: np.ndarray | None = None) -> np.ndarray:
-    """Triangles (F, 3) of polygons of `sizes` (P,) corners, each cut into a fan around its first corner.
+    """Triangulate polygons of `sizes` (P,) corners into (F, 3), each as a fan around its first corner.
 
-    Where two polygons would be cut along one line, or one along an edge of another, it is a fan around a later corner.
-    Vertex numbers alone decide, so that a mesh is cut alike in all its poses; of `vertices` (count, 3) a UserWarning
-    tells how many polygons are so bent or hollow that they fold over where they are cut.
+    The fan is around a later corner if a diagonal would coincide with an edge or diagonal of another polygon. Only
+    vertex numbers decide, so that a mesh is triangulated alike in all poses. With `vertices` (count, 3), a UserWarning
+    counts polygons that fold over because they are bent or concave.
 
-    `corners` are their vertices, of `count`, one polygon after the other; `numbers` the lines of the polygons.
-    Polygons of fewer than three corners are left out, with a UserWarning; MeshFileError for a vertex out of range.
+    `corners` are the vertices, of `count`, one polygon after the other. `numbers` are line numbers for errors. Polygons
+    with fewer than three corners are left out, with a UserWarning. MeshFileError for a vertex out of range.
     """
     sizes, corners = np.asarray(sizes, dtype=np.int64), np.asarray(corners, dtype=np.int64)
     start = np.cumsum(sizes) - sizes
 
     def where(p: int) -> str:
+        """Name a polygon for an error message."""
         return f"{path}: " + (f"line {numbers[p]}: " if numbers is not None else "") + f"face {p}"
 
     outside = np.flatnonzero((corners < 0) | (corners >= count))
     if len(outside):
         p = int(np.searchsorted(start, outside[0], side="right")) - 1
         raise MeshFileError(f"{where(p)} refers to vertex {corners[outside[0]]}, expected 0..{count - 1}")
-    few = np.flatnonzero(sizes < 3)
-    if len(few):
-        problem = f"{where(few[0])} has {sizes[few[0]]} corners, expected at least 3"
-        if len(few) == len(sizes):
+    too_small = np.flatnonzero(sizes < 3)
+    if len(too_small):
+        problem = f"{where(too_small[0])} has {sizes[too_small[0]]} corners, expected at least 3"
+        if len(too_small) == len(sizes):
             raise MeshFileError(problem)
-        warnings.warn(f"{problem}; {len(few)} such faces were left out", stacklevel=4)
+        warnings.warn(f"{problem}; {len(too_small)} such faces were left out", stacklevel=4)
         corners, sizes = corners[np.repeat(sizes >= 3, sizes)], sizes[sizes >= 3]
         start = np.cumsum(sizes) - sizes
     if (sizes == 3).all():
         return corners.reshape(-1, 3)
+    # fan of n - 2 triangles around corner `first` of each polygon
     first = _cuts_that_meet_nothing(sizes, corners, count)
     of = np.repeat(np.arange(len(sizes)), sizes - 2)
     within = np.arange(len(of)) - np.repeat(np.cumsum(sizes - 2) - (sizes - 2), sizes - 2) + first[of]
@@ -240,10 +244,10 @@ def polygons(path: Path, sizes: np.ndarray, corners: np.ndarray, count: int,
 
 
 def strip_triangles(corners: np.ndarray, sizes: np.ndarray) -> np.ndarray:
-    """(F, 3) the triangles of strips, those of a strip turned the same way; those that repeat a corner are left out.
+    """Convert triangle strips to triangles (F, 3) of one orientation, without degenerate ones.
 
-    `corners` are the vertices of one strip after the other, `sizes` (S,) how many each has: scanners write them by the
-    ten thousand.
+    `corners` are the vertices of one strip after the other, `sizes` (S,) their numbers. Scanners write tens of
+    thousands of strips.
     """
     count = np.maximum(sizes - 2, 0)
     within = np.arange(count.sum()) - np.repeat(np.cumsum(count) - count, count)
@@ -254,9 +258,9 @@ def strip_triangles(corners: np.ndarray, sizes: np.ndarray) -> np.ndarray:
 
 
 def _find_folds(vertices: np.ndarray, faces: np.ndarray, of: np.ndarray) -> np.ndarray:
-    """The polygons some of whose triangles (F, 3), `of` (F,) them, face away from the whole."""
+    """Find polygons with triangles (F, 3), of polygon `of` (F,), that face against the whole polygon."""
     c = vertices[faces]
-    with np.errstate(all="ignore"):                          # what is not finite is refused later
+    with np.errstate(all="ignore"):                          # values that are not finite are refused later
         area = np.cross(c[:, 1] - c[:, 0], c[:, 2] - c[:, 0])
         whole = np.zeros((of[-1] + 1, 3))
         np.add.at(whole, of, area)
@@ -264,8 +268,9 @@ def _find_folds(vertices: np.ndarray, faces: np.ndarray, of: np.ndarray) -> np.n
 
 
 def _cuts_that_meet_nothing(sizes: np.ndarray, corners: np.ndarray, count: int) -> np.ndarray:
-    """(P,) the corner of each polygon from which it is cut: the first whose cuts are no edges of other polygons."""
+    """Choose the fan corner (P,) of each polygon: the first whose diagonals are no edges of other polygons."""
     start = np.cumsum(sizes) - sizes
+    # keys of all sides, and of all diagonals of fans around first corners; those used twice are crowded
     following = np.arange(len(corners)) + 1
     following[start + sizes - 1] = start
     sides = _edge_key(corners, corners[following], count)
@@ -277,6 +282,7 @@ def _cuts_that_meet_nothing(sizes: np.ndarray, corners: np.ndarray, count: int) 
     crowded = np.isin(cuts, sides) | (times[which] > 1)
     if not crowded.any():
         return first
+    # for crowded polygons, try each corner and take the one whose diagonals meet fewest others
     users: dict[int, list[int]] = {}
     for key, p in zip(np.r_[sides, cuts[~crowded]].tolist(), np.r_[np.repeat(np.arange(len(sizes)), sizes),
                                                                   of[~crowded]].tolist(), strict=True):
@@ -284,10 +290,10 @@ def _cuts_that_meet_nothing(sizes: np.ndarray, corners: np.ndarray, count: int) 
     rings = [set(ring.tolist()) for ring in np.split(corners, start[1:])]
     for p in np.unique(of[crowded]):
         ring, n = corners[start[p]:start[p] + sizes[p]], int(sizes[p])
-        if len(rings[p]) < n:                # it meets itself, and a thousand corners that repeat take many seconds
+        if len(rings[p]) < n:                # repeated corners: it meets itself anyway, and trying all corners is slow
             continue
         ways = [_edge_key(ring[k], ring[(k + np.arange(2, n - 1)) % n], count).tolist() for k in range(n)]
-        # polygons that repeat each other meet however they are cut
+        # duplicate polygons meet whatever the corner, so they do not count
         met = [sum(not (rings[q] <= rings[p] or rings[p] <= rings[q]) for key in way for q in users.get(key, ()))
                for way in ways]
         first[p] = int(np.argmin(met))
@@ -297,14 +303,15 @@ def _cuts_that_meet_nothing(sizes: np.ndarray, corners: np.ndarray, count: int) 
 
 
 def _edge_key(a: np.ndarray, b: np.ndarray, count: int) -> np.ndarray:
+    """Return one number per undirected edge."""
     return np.minimum(a, b) * count + np.maximum(a, b)
 
 
 def as_colors(values: np.ndarray, whole: bool = False) -> np.ndarray:
-    """Colours (N, 3) in [0, 1] of a file that does not say which value is white.
+    """Scale colours (N, 3) to [0, 1], for a file that does not say which value is white.
 
-    It is 1, or 255 where a value is beyond that or all must be `whole` numbers, or 65535 where one is beyond 255.
-    Some programs write floats a little above 1 for highlights, so 255 begins at 2.
+    White is 1; 255 if a value is larger or all are `whole` numbers; 65535 if one is above 255. Some programs write
+    floats a little above 1 for highlights, so 255 starts at 2.
     """
     largest = np.nanmax(values, initial=0)
     white = 1 if largest <= 2 and not whole else 255 if largest <= 255 else 65535
@@ -312,42 +319,42 @@ def as_colors(values: np.ndarray, whole: bool = False) -> np.ndarray:
 
 
 def as_seen(linear: np.ndarray) -> np.ndarray:
-    """sRGB values in [0, 1], as screens show them, of linear light, which is clipped to [0, 1]."""
+    """Convert linear light, clipped to [0, 1], to sRGB values in [0, 1]."""
     linear = np.clip(linear, 0, 1)
     return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
 
 
 def as_light(color: np.ndarray) -> np.ndarray:
-    """Linear light of sRGB values in [0, 1]."""
+    """Convert sRGB values in [0, 1] to linear light."""
     color = np.asarray(color, dtype=float)
     return np.where(color <= 0.04045, color / 12.92, ((color + 0.055) / 1.055) ** 2.4)
 
 
 def quantise_colors(colors: np.ndarray) -> np.ndarray:
-    """Colours in [0, 1] as integers 0..255."""
+    """Convert colours in [0, 1] to integers 0..255."""
     return np.clip(np.rint(255 * colors), 0, 255).astype(np.uint8)
 
 
 def as_rows(columns: Iterable[tuple[Sequence[str], str, np.ndarray | None]]) -> np.ndarray:
-    """Rows with named fields, little-endian, of arrays (N, k) with the names of their columns and their kind."""
-    given = [(names, kind, values) for names, kind, values in columns if values is not None]
-    rows = np.zeros(len(given[0][2]), dtype=[(name, "<" + kind) for names, kind, _ in given for name in names])
-    for names, _, values in given:
+    """Build rows with named little-endian fields from arrays (N, k), each with its column names and kind."""
+    present = [(names, kind, values) for names, kind, values in columns if values is not None]
+    rows = np.zeros(len(present[0][2]), dtype=[(name, "<" + kind) for names, kind, _ in present for name in names])
+    for names, _, values in present:
         for name, column in zip(names, values.T, strict=True):
             rows[name] = column
     return rows
 
 
 def fields_of(rows: np.ndarray) -> list[tuple[str, str]]:
-    """The name and the kind, such as `<f4`, of every field."""
+    """Return name and kind, such as `<f4`, of every field."""
     return [(name, rows.dtype[name].str) for name in rows.dtype.names or ()]
 
 
 def text_rows(form: str, *columns: np.ndarray) -> str:
-    """One line for each row of arrays (N, k) side by side; `form` is that of a line."""
+    """Format arrays (N, k), side by side, one line per row; `form` is the format of a line."""
     return (form + "\n") * len(columns[0]) % tuple(np.hstack(columns).ravel().tolist())
 
 
 def three_numbers(double: bool) -> str:
-    """The form of the coordinates of a point in a line of text."""
+    """Return the format of a point in a line of text."""
     return "%.12g %.12g %.12g" if double else "%.8g %.8g %.8g"

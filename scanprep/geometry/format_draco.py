@@ -11,7 +11,7 @@ from .format_common import Contents, MeshFileError, as_colors, polygons
 
 
 def read(path: Path, data: bytes) -> Contents:
-    """The points, and the triangles, normals and colours if any, of a `.drc` file."""
+    """Read points, and triangles, normals and colours if any, of a `.drc` file."""
     mesh = decode_draco(path, data)
     with storage.taking_apart(path, "a whole Draco file", MeshFileError):
         vertices = np.asarray(mesh.points, dtype=np.float64).reshape(-1, 3)
@@ -25,7 +25,7 @@ def read(path: Path, data: bytes) -> Contents:
 
 
 def decode_draco(path: Path, data: bytes) -> Any:
-    """What DracoPy makes of a piece of data; MeshFileError where it is damaged or the library is not there."""
+    """Decode Draco data; MeshFileError if it is damaged or the library is missing."""
     try:
         import DracoPy
     except ImportError:

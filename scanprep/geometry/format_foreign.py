@@ -16,25 +16,25 @@ from .format_common import Contents, MeshFileError, polygons
 MESHES = (".3ds", ".x3d", ".x3dv", ".wrl", ".ctm", ".qobj")
 POINTS = (".e57", ".ptx")
 
-# what nobody reads, and a program that writes something else of it
+# formats that are not read, with a program that converts them
 _EXPORTS = {**dict.fromkeys((".las", ".laz"), "CloudCompare (File > Save as) makes PLY of it"),
             **dict.fromkeys((".fbx", ".blend", ".usd", ".usda", ".usdc", ".usdz"),
                             "Blender (File > Open or Import, then Export) makes GLB of it")}
 
 
 def advice(ending: str) -> str:
-    """What to do with a file of an ending that is not read; empty where nothing is known."""
+    """Return advice for a file of an unsupported format; empty if there is none."""
     return f"; {_EXPORTS[ending]}" if ending in _EXPORTS else ""
 
 
 def read(path: Path, data: bytes) -> Contents:
-    """The vertices, triangles and colours of a file as MeshLab has them.
+    """Read vertices, triangles and colours of a file with MeshLab.
 
-    Its readers end the whole process on some damaged files, so they have one of their own.
+    Some damaged files make its readers end the whole process, so they run in a separate one.
     """
     if path.suffix.lower() == ".gz":
         raise MeshFileError(f"{path}: a packed file of this format is not read here: unpack it first")
-    seconds = 600  # for one file: a cloud of 2 GB takes 90
+    seconds = 600  # timeout; a cloud of 2 GB takes 90 s
     with tempfile.TemporaryDirectory() as folder:
         made = Path(folder) / "read.npz"
         command = [sys.executable, "-m", "scanprep.adapters.pymeshlab_filters", str(path.absolute()), str(made)]

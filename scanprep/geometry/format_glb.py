@@ -1,8 +1,8 @@
-"""glTF 2.0, in one file (GLB) or with files beside it: all triangles of the scene, each mesh where its node puts it.
+"""Read and write glTF 2.0 (GLB, or glTF with separate files): all triangles of the scene, placed by their nodes.
 
-glTF has y up and no body here has an axis that is up, so what is written is turned: by `tallest`, or by the axis that
-the caller knows. The file names that axis in `asset.extras`, and the reader turns it back. A file that names none comes
-from elsewhere, or was written before there was a name: it is read as it stands.
+glTF has y up, but no axis is assumed to be up here. So written bodies are rotated by the axis from `tallest`, or one
+that the caller knows. The file stores that axis in `asset.extras`, and the reader rotates back. Other files are read as
+they are.
 """
 from __future__ import annotations
 
@@ -22,24 +22,23 @@ from .format_common import Contents, MeshFileError, as_light, as_seen, load_byte
 from .mesh import Mesh
 
 _COMPONENTS = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
-VERTICES, _INDICES = 34962, 34963     # what a graphics card will use the numbers for
+VERTICES, _INDICES = 34962, 34963     # glTF buffer targets: vertex attributes, indices
 _NUMBERS = {np.dtype(kind).str: number for number, kind in _COMPONENTS.items()}
 GENERATOR = "scapekit"
 
 
 _DRACO, _INSTANCES = "KHR_draco_mesh_compression", "EXT_mesh_gpu_instancing"
-# extensions that a file may require and that are read here, or that leave triangles as they are
+# required extensions that are supported, and prefixes of those that do not change triangles
 _KNOWN = (_DRACO, _INSTANCES, "KHR_mesh_quantization")
 _HARMLESS = ("KHR_materials_", "KHR_texture_", "EXT_texture_", "MSFT_texture_", "KHR_lights_", "EXT_lights_",
              "KHR_animation_", "KHR_xmp", "KHR_technique")
 
 
 def read(path: Path, data: bytes) -> Contents:
-    """The meshes of the scene of a GLB file one after the other, in scene coordinates; lines are left out, and points
-    where there are triangles.
+    """Read all meshes of the scene of a GLB file as one, in scene coordinates.
 
-    The axes are those of the body where the file tells which of them was turned to y. A mesh that hangs on joints is
-    where the joints of the scene carry it, which is what every program shows.
+    Lines are left out, and points if there are triangles. Axes are rotated back if the file says which axis was turned
+    to y. Skinned meshes are posed by their joints, as every program shows them.
     """
     tree, binary = chunks_of(path, data)
     with storage.taking_apart(path, "a whole GLB file", MeshFileError), np.errstate(all="ignore"):
@@ -47,7 +46,7 @@ def read(path: Path, data: bytes) -> Contents:
 
 
 def read_gltf(path: Path, data: bytes) -> Contents:
-    """As `read`, of a `.gltf` file: JSON with its numbers in it or in files beside it."""
+    """Read a `.gltf` file as `read` does: JSON, with buffers inside or in files beside it."""
     tree = storage.parse_json(path, data, "a glTF file", MeshFileError)
     with storage.taking_apart(path, "a whole glTF file", MeshFileError), np.errstate(all="ignore"):
         if not str(tree["asset"]["version"]).startswith("2"):
@@ -56,9 +55,9 @@ def read_gltf(path: Path, data: bytes) -> Contents:
 
 
 def _one_buffer(path: Path, tree: dict[str, Any], binary: bytes) -> bytes:
-    """All buffers of a file one after the other, `binary` the one inside it; its views are moved to where they are."""
+    """Concatenate all buffers of a file, `binary` being the internal one, and move the buffer views accordingly."""
     buffers, starts = list[bytes](), list[int]()
-    for entry in tree.get("buffers") or [{}]:          # without a list of them there is the one inside
+    for entry in tree.get("buffers") or [{}]:          # without a list there is only the internal one
         uri = entry.get("uri")
         if uri is None:
             data = binary
@@ -77,7 +76,7 @@ def _one_buffer(path: Path, tree: dict[str, Any], binary: bytes) -> bytes:
 
 
 def file_beside(path: Path, name: str) -> Path:
-    """A file that another one names; MeshFileError where it does not lie in the folder of that one, or below."""
+    """Return the path of a file that another one names; MeshFileError if it is outside that one's folder."""
     try:
         return storage.path_inside(path.parent, unquote(name), path)
     except storage.StorageError as problem:
@@ -85,6 +84,7 @@ def file_beside(path: Path, name: str) -> Path:
 
 
 def _scene(path: Path, tree: dict[str, Any], binary: bytes) -> Contents:
+    """Collect vertices, triangles and colours of all nodes of the scene."""
     needed = [str(name) for name in tree.get("extensionsRequired", [])]
     unknown = [name for name in needed if name not in _KNOWN and not name.startswith(_HARMLESS)]
     if unknown:
@@ -94,7 +94,7 @@ def _scene(path: Path, tree: dict[str, Any], binary: bytes) -> Contents:
     faces: list[np.ndarray] = []
     colors: list[np.ndarray | None] = []
     objects: list[tuple[str, int]] = []
-    start, most = 0, 10**6 + 4 * len(binary)    # many nodes may show one mesh, but not without end
+    start, most = 0, 10**6 + 4 * len(binary)    # nodes may share a mesh, but not without limit
     nodes = list(nodes_of(tree))
     places = {number: matrix for number, _, matrix in nodes}
     kinds = {p.get("mode", 4) for mesh in tree.get("meshes", []) for p in mesh["primitives"]}
@@ -104,6 +104,7 @@ def _scene(path: Path, tree: dict[str, Any], binary: bytes) -> Contents:
             continue
         name = node.get("name") or item(tree["meshes"], node["mesh"]).get("name") or f"node {number}"
         joints = joint_matrices(tree, binary, item(tree["skins"], node["skin"]), places) if "skin" in node else None
+        # every instance of the node's mesh, every primitive; skinned vertices by their joints, others by the matrix
         for instance in _instances(tree, binary, node, matrix):
             before = len(faces)
             placed: dict[tuple[int, Any], int] = {}                # primitives may share their vertices
@@ -123,6 +124,7 @@ def _scene(path: Path, tree: dict[str, Any], binary: bytes) -> Contents:
                     start += len(local)
                 corners = primitive_triangles(own, data, primitive, len(local)) if 0 not in shown else np.zeros((0, 3),
                                                                                                                 int)
+                # a mirroring matrix inverts triangles
                 if np.linalg.det((instance if joints is None else joints[0])[:3, :3]) < 0:
                     corners = corners[:, ::-1]
                 faces.append(polygons(path, np.full(len(corners), 3), corners.ravel(), len(local)) + placed[points])
@@ -139,23 +141,23 @@ def _scene(path: Path, tree: dict[str, Any], binary: bytes) -> Contents:
 
 
 def _instances(tree: dict[str, Any], binary: bytes, node: dict[str, Any], matrix: np.ndarray) -> list[np.ndarray]:
-    """The matrices (4, 4) of every time that a node shows its mesh: once, or as EXT_mesh_gpu_instancing says."""
-    told = node.get("extensions", {}).get(_INSTANCES)
-    if told is None:
+    """Return the matrices (4, 4) of all instances of a node's mesh: one, or those of EXT_mesh_gpu_instancing."""
+    instancing = node.get("extensions", {}).get(_INSTANCES)
+    if instancing is None:
         return [matrix]
-    rows = {key: accessor(tree, binary, told["attributes"][name], kind).astype(np.float64).tolist()
+    rows = {key: accessor(tree, binary, instancing["attributes"][name], kind).astype(np.float64).tolist()
             for key, name, kind in (("translation", "TRANSLATION", "VEC3"), ("rotation", "ROTATION", "VEC4"),
-                                    ("scale", "SCALE", "VEC3")) if name in told["attributes"]}
+                                    ("scale", "SCALE", "VEC3")) if name in instancing["attributes"]}
     count = min(map(len, rows.values()), default=0)
     return [matrix @ _matrix({key: values[i] for key, values in rows.items()}) for i in range(count)]
 
 
 def _unpack(path: Path, tree: dict[str, Any], binary: bytes, primitive: dict[str, Any]
               ) -> tuple[dict[str, Any], dict[str, Any], bytes]:
-    """A primitive, and the tree and buffer that hold its numbers: one of its own where Draco has compressed them."""
+    """Return a primitive with its tree and buffer; a Draco-compressed one is decoded into its own tree and buffer."""
     packed = primitive.get("extensions", {}).get(_DRACO)
     if packed is None or "bufferView" in item(tree["accessors"], primitive["attributes"]["POSITION"]):
-        return primitive, tree, binary           # not compressed, or also as it is for who does not know Draco
+        return primitive, tree, binary           # not compressed, or with an uncompressed copy
     view = item(tree["bufferViews"], packed["bufferView"])
     start = view.get("byteOffset", 0)
     mesh = format_draco.decode_draco(path, binary[start:start + view["byteLength"]])
@@ -172,7 +174,7 @@ def _unpack(path: Path, tree: dict[str, Any], binary: bytes, primitive: dict[str
 
 def joint_matrices(tree: dict[str, Any], binary: bytes, skin: dict[str, Any], places: dict[int, np.ndarray]
                    ) -> np.ndarray:
-    """(J, 4, 4) how every joint of a skin carries the vertices from where they are stored to where they are shown."""
+    """Compute the skinning matrices (J, 4, 4): joint matrix times inverse bind matrix."""
     missing = [number for number in skin["joints"] if number not in places]
     if missing:
         raise ValueError(f"joint {missing[0]} does not stand in the scene")
@@ -184,7 +186,7 @@ def joint_matrices(tree: dict[str, Any], binary: bytes, skin: dict[str, Any], pl
 
 
 def weights_of(tree: dict[str, Any], binary: bytes, primitive: dict[str, Any], joints: int) -> np.ndarray:
-    """(n, J) how much each joint moves every vertex of a primitive, one in all."""
+    """Read the blend weights (n, J) of a primitive; rows sum to one."""
     attributes = primitive["attributes"]
     count = item(tree["accessors"], attributes["POSITION"])["count"]
     sets = sorted(name for name in attributes if name.startswith("WEIGHTS_"))
@@ -207,17 +209,17 @@ def weights_of(tree: dict[str, Any], binary: bytes, primitive: dict[str, Any], j
 
 
 def apply_skin(points: np.ndarray, weights: np.ndarray, joints: np.ndarray) -> np.ndarray:
-    """(n, 3) vertices where their joints carry them: weights (n, J), matrices (J, 4, 4)."""
-    if np.allclose(joints, np.eye(4), atol=1e-6):            # in its bind pose: the very same numbers
+    """Apply linear blend skinning to points (n, 3): weights (n, J), matrices (J, 4, 4)."""
+    if np.allclose(joints, np.eye(4), atol=1e-6):            # bind pose: keep the exact numbers
         return points
     one = np.column_stack([points, np.ones(len(points))])
     return np.asarray(np.einsum("nj,jab,nb->na", weights, joints, one, optimize=True)[:, :3])
 
 
 def turn_up(up: int) -> np.ndarray:
-    """The rotation (3, 3) that brings an axis to +y; points, poses and trans turn as `x @ turn_up(up).T`.
+    """Return the rotation (3, 3) that takes an axis to +y; points, poses and trans transform as `x @ turn_up(up).T`.
 
-    A rotation vector turns like a point because the axes of all parts are those of the world at rest.
+    Rotation vectors transform like points, because all part frames are parallel to the world at rest.
     """
     if up not in (0, 1, 2):
         raise ValueError(f"up: expected 0, 1 or 2, got {up}")
@@ -225,13 +227,14 @@ def turn_up(up: int) -> np.ndarray:
 
 
 def tallest(vertices: np.ndarray) -> int:
-    """The axis that is probably up: that of the largest extent.
+    """Guess the axis that is up: that of the largest extent.
 
-    Where the next one is nearly as large, as of somebody with the arms spread, it is the next one if the body is alike
-    on both sides of the first, and not of that.
+    With spread arms the second extent is nearly as large. Then the second axis is up if the body is symmetric along the
+    first one, and not along the second.
     """
     extent = np.ptp(vertices, axis=0)
     first, second = np.argsort(-extent, kind="stable")[:2]
+    # asymmetry of the histograms along both axes; limits separate people with spread arms
     sided = [np.histogram(vertices[:, axis], 10)[0] for axis in (first, second)]
     here, there = (np.abs(count - count[::-1]).sum() / len(vertices) for count in sided)
     spread = extent[second] > 0.85 * extent[first] and here < 0.25 and here < 0.5 * there
@@ -239,7 +242,7 @@ def tallest(vertices: np.ndarray) -> int:
 
 
 def up_of(tree: dict[str, Any]) -> int:
-    """The axis of the body that was turned to y, as the file says; 1, none was turned, where it does not."""
+    """Return the axis of the body that was rotated to y, as the file says; 1 (no rotation) if it does not."""
     asset = tree.get("asset")
     if not isinstance(asset, dict) or asset.get("generator") != GENERATOR or not isinstance(asset.get("extras"), dict):
         return 1
@@ -248,14 +251,14 @@ def up_of(tree: dict[str, Any]) -> int:
 
 
 def item(values: list[Any], number: Any) -> Any:
-    """The entry of this number, which JSON may have as anything."""
+    """Return the entry of this number; ValueError for anything that is no valid index."""
     if isinstance(number, bool) or not isinstance(number, int) or not 0 <= number < len(values):
         raise ValueError(f"it refers to number {number!r} of {len(values)}")
     return values[number]
 
 
 def chunks_of(path: Path, data: bytes) -> tuple[dict[str, Any], bytes]:
-    """The tree of JSON and the binary buffer of a GLB file."""
+    """Split a GLB file into its JSON tree and its binary buffer."""
     if data[:4] != b"glTF" or len(data) < 20:
         raise MeshFileError(f"{path}: expected a GLB file that begins with 'glTF', found {quote(data[:20])}")
     version, length = struct.unpack_from("<II", data, 4)
@@ -277,7 +280,7 @@ def chunks_of(path: Path, data: bytes) -> tuple[dict[str, Any], bytes]:
 
 
 def nodes_of(tree: dict[str, Any]) -> Iterator[tuple[int, dict[str, Any], np.ndarray]]:
-    """Every node of the scene (or below all roots without one), its number and matrix (4, 4), parents first."""
+    """Yield every node of the scene (or all nodes without one): number, node and world matrix (4, 4), parents first."""
     nodes = tree.get("nodes", [])
     if tree.get("scenes"):
         roots = item(tree["scenes"], tree.get("scene", 0)).get("nodes", [])
@@ -298,6 +301,7 @@ def nodes_of(tree: dict[str, Any]) -> Iterator[tuple[int, dict[str, Any], np.nda
 
 
 def _matrix(node: dict[str, Any]) -> np.ndarray:
+    """Return the local matrix (4, 4) of a node: given, or from translation, rotation and scale."""
     if "matrix" in node:
         return np.array(node["matrix"], dtype=np.float64).reshape(4, 4).T
     x, y, z, w = node.get("rotation", (0, 0, 0, 1))
@@ -311,7 +315,7 @@ def _matrix(node: dict[str, Any]) -> np.ndarray:
 
 
 def accessor(tree: dict[str, Any], binary: bytes, number: int, *types: str) -> np.ndarray:
-    """(count, width) the values of an accessor of one of these types; integers that mean 0..1 or -1..1 as floats."""
+    """Read an accessor (count, width) of one of these types; normalised integers become floats."""
     entry = item(tree["accessors"], number)
     kind, count = np.dtype(_COMPONENTS[entry["componentType"]]), entry["count"]
     if entry["type"] not in types:
@@ -324,11 +328,12 @@ def accessor(tree: dict[str, Any], binary: bytes, number: int, *types: str) -> n
         values = np.zeros((count, width), kind)
     else:
         raise ValueError(f"accessor {number}: {count} zeros")
-    if "sparse" in entry:                # some values are others
-        few = entry["sparse"]
-        which = _values(tree, binary, f"accessor {number}", few["indices"],
-                        np.dtype(_COMPONENTS[few["indices"]["componentType"]]), few["count"], 1)
-        values[which[:, 0]] = _values(tree, binary, f"accessor {number}", few["values"], kind, few["count"], width)
+    if "sparse" in entry:                # some values are replaced
+        sparse = entry["sparse"]
+        which = _values(tree, binary, f"accessor {number}", sparse["indices"],
+                        np.dtype(_COMPONENTS[sparse["indices"]["componentType"]]), sparse["count"], 1)
+        values[which[:, 0]] = _values(tree, binary, f"accessor {number}", sparse["values"], kind, sparse["count"],
+                                      width)
     if entry.get("normalized") and kind.kind in "iu":
         return np.maximum(values / np.iinfo(kind).max, -1.0)
     return values
@@ -336,7 +341,7 @@ def accessor(tree: dict[str, Any], binary: bytes, number: int, *types: str) -> n
 
 def _values(tree: dict[str, Any], binary: bytes, what: str, entry: dict[str, Any], kind: np.dtype, count: int,
             width: int) -> np.ndarray:
-    """(count, width) a copy of numbers in the buffer."""
+    """Copy numbers (count, width) from the buffer, with bounds checked."""
     view, size = item(tree["bufferViews"], entry["bufferView"]), kind.itemsize * width
     start = view.get("byteOffset", 0) + entry.get("byteOffset", 0)
     stride = view.get("byteStride", size)
@@ -348,7 +353,7 @@ def _values(tree: dict[str, Any], binary: bytes, what: str, entry: dict[str, Any
 
 
 def primitive_triangles(tree: dict[str, Any], binary: bytes, primitive: dict[str, Any], count: int) -> np.ndarray:
-    """(F, 3) the corners of the triangles, strips or fans of a primitive of `count` vertices."""
+    """Return the triangles (F, 3) of a primitive of `count` vertices, from triangles, strips or fans."""
     line = (accessor(tree, binary, primitive["indices"], "SCALAR")[:, 0].astype(np.int64) if "indices" in primitive
             else np.arange(count))
     mode = primitive.get("mode", 4)
@@ -360,7 +365,7 @@ def primitive_triangles(tree: dict[str, Any], binary: bytes, primitive: dict[str
 
 
 def _colors(tree: dict[str, Any], binary: bytes, primitive: dict[str, Any], count: int) -> np.ndarray | None:
-    """The vertex colours as they are seen on a screen: glTF stores them linear in light."""
+    """Read vertex colours as sRGB; glTF stores linear light."""
     if "COLOR_0" not in primitive["attributes"]:
         return None
     values = accessor(tree, binary, primitive["attributes"]["COLOR_0"], "VEC3", "VEC4")
@@ -370,7 +375,7 @@ def _colors(tree: dict[str, Any], binary: bytes, primitive: dict[str, Any], coun
 
 
 def encode(contents: Contents, double: bool) -> bytes:
-    """A GLB file of one mesh with normals, in single precision whatever `double` says."""
+    """Encode one mesh with normals as GLB, always in single precision."""
     assert contents.faces is not None, "a GLB file is written for meshes"
     up = tallest(contents.vertices)
     glb, mesh = Glb(), Mesh(contents.vertices @ turn_up(up).T, contents.faces, contents.colors)
@@ -379,13 +384,13 @@ def encode(contents: Contents, double: bool) -> bytes:
 
 
 def one_mesh(mesh: dict[str, Any], material: dict[str, Any], node: dict[str, Any]) -> dict[str, Any]:
-    """The document of a scene that shows one mesh in one node, for `Glb.pack`."""
+    """Build the document of a scene with one mesh in one node, for `Glb.pack`."""
     return {"scene": 0, "scenes": [{"nodes": [0]}], "nodes": [{**node, "mesh": 0}], "meshes": [mesh],
             "materials": [material]}
 
 
 class Glb:
-    """Arrays gathered into the one buffer of a binary glTF file."""
+    """Collects arrays into the one buffer of a binary glTF file."""
 
     def __init__(self) -> None:
         self._data = bytearray()
@@ -393,9 +398,9 @@ class Glb:
         self._accessors: list[dict[str, Any]] = []
 
     def add(self, array: np.ndarray, kind: str, target: int | None, bounds: bool = False) -> int:
-        """An accessor of float32 numbers, one of `kind` a row (a MAT4 column after column); its index.
+        """Add float32 numbers, one `kind` per row (a MAT4 by columns); return the index of the accessor.
 
-        `target` is `VERTICES` for what vertices have; glTF wants `bounds` of positions and times.
+        `target` is `VERTICES` for vertex attributes. glTF requires `bounds` for positions and times.
         """
         values = np.ascontiguousarray(array, dtype="<f4")
         extra: dict[str, Any] = {}
@@ -405,20 +410,20 @@ class Glb:
         return self._append(values, len(values), kind, target, extra)
 
     def add_indices(self, faces: np.ndarray) -> int:
-        """An accessor of the corners of triangles; its index."""
+        """Add the corners of triangles; return the index of the accessor."""
         return self._append(np.ascontiguousarray(faces, dtype="<u4"), faces.size, "SCALAR", _INDICES, {})
 
     def add_raw(self, values: np.ndarray, kind: str, normalized: bool) -> int:
-        """An accessor of numbers of whatever type; its index."""
+        """Add numbers of any type; return the index of the accessor."""
         values = np.ascontiguousarray(values, dtype=values.dtype.newbyteorder("<"))
         return self._append(values, len(values), kind, None, {"normalized": normalized})
 
     def add_surface(self, mesh: Mesh, normals: np.ndarray | None = None, uv: np.ndarray | None = None,
                     targets: Iterable[np.ndarray] = ()) -> dict[str, Any]:
-        """A surface as a primitive of `meshes`, with its colours and of the first material.
+        """Add a surface with its colours and the first material; return a primitive of `meshes`.
 
-        Unit normals (N, 3) are its own unless given. `uv` (N, 2) are places in images, (0, 0) in the lower left corner.
-        `targets` are changes (N, 3) of the vertices, metres: morph targets, with those of the normals.
+        Unit normals (N, 3) are computed unless given. `uv` (N, 2) are image coordinates, (0, 0) at the lower left.
+        `targets` are morph targets: vertex displacements (N, 3), metres; those of normals are added.
         """
         normals = some_normal(mesh) if normals is None else normals
         out: dict[str, Any] = {"attributes": {"POSITION": self.add(mesh.vertices, "VEC3", VERTICES, bounds=True),
@@ -435,21 +440,22 @@ class Glb:
         return out
 
     def parts(self) -> tuple[dict[str, Any], bytes]:
-        """The tree that `accessor` reads and the buffer, without a file."""
+        """Return the tree and buffer that `accessor` reads, without a file."""
         return {"bufferViews": self._views, "accessors": self._accessors}, bytes(self._data)
 
     def add_joints(self, joints: np.ndarray) -> int:
-        """An accessor of the four joints (n, 4) of every vertex, in one or two bytes; its index."""
+        """Add the four joints (n, 4) of every vertex, in one or two bytes; return the index of the accessor."""
         kind = "|u1" if joints.max(initial=0) < 256 else "<u2"
         return self._append(np.ascontiguousarray(joints, dtype=kind), len(joints), "VEC4", VERTICES, {})
 
     def add_png(self, data: bytes, name: str) -> dict[str, Any]:
-        """An entry of `images`."""
+        """Add a PNG image; return its entry of `images`."""
         self._views.append({"buffer": 0, "byteOffset": len(self._data), "byteLength": len(data)})
         self._data += data + b"\0" * (-len(data) % 4)
         return {"name": name, "mimeType": "image/png", "bufferView": len(self._views) - 1}
 
     def _append(self, values: np.ndarray, count: int, kind: str, target: int | None, extra: dict[str, Any]) -> int:
+        """Append values as a new buffer view and accessor; return the index of the accessor."""
         view: dict[str, Any] = {"buffer": 0, "byteOffset": len(self._data), "byteLength": values.nbytes}
         if target is not None:
             view["target"] = target
@@ -460,12 +466,13 @@ class Glb:
         return len(self._accessors) - 1
 
     def pack(self, document: dict[str, Any], up: int) -> bytes:
-        """The file: header, JSON, buffer; its vertices have been turned by `turn_up(up)`."""
+        """Encode the file: header, JSON, buffer. Its vertices have been rotated by `turn_up(up)`."""
         asset = {"version": "2.0", "generator": GENERATOR, "extras": {"up": "xyz"[up]}}
         document = {"asset": asset, **document,
                     "buffers": [{"byteLength": len(self._data)}], "bufferViews": self._views,
                     "accessors": self._accessors}
         text = json.dumps(document, separators=(",", ":")).encode()
+        # both chunks are padded to multiples of four bytes
         text += b" " * (-len(text) % 4)
         data = bytes(self._data) + b"\0" * (-len(self._data) % 4)
         size = 12 + 8 + len(text) + 8 + len(data)
@@ -474,7 +481,7 @@ class Glb:
 
 
 def some_normal(mesh: Mesh) -> np.ndarray:
-    """Unit normals at all vertices: glTF allows no zero normal, not even where there are no triangles."""
+    """Return unit normals (N, 3) at all vertices; z without triangles, as glTF allows no zero normal."""
     normals = np.array(mesh.vertex_normals)
     normals[~normals.any(axis=1)] = (0, 0, 1)
     return normals

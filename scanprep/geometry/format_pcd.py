@@ -1,4 +1,4 @@
-"""PCD, the point cloud file of PCL: ascii, binary, and binary compressed by LZF."""
+"""Read and write PCD, the point cloud format of PCL: ascii, binary, and LZF-compressed binary."""
 from __future__ import annotations
 
 import struct
@@ -13,7 +13,7 @@ _KEYS = (b"VERSION", b"FIELDS", b"SIZE", b"TYPE", b"COUNT", b"WIDTH", b"HEIGHT",
 
 
 def read(path: Path, data: bytes) -> Contents:
-    """The points, normals and colours of a PCD file; points without return are not finite."""
+    """Read points, normals and colours of a PCD file; missing points are not finite."""
     header, start, line = _header(path, data)
     names = header[b"FIELDS"]
     try:
@@ -26,6 +26,7 @@ def read(path: Path, data: bytes) -> Contents:
                             f"({error})") from None
     if not {b"x", b"y", b"z"} <= set(names):
         raise MeshFileError(f"{path}: expected fields x, y, z in the PCD header, found {quote(b' '.join(names))}")
+    # three encodings of the same columns
     how = header[b"DATA"][0]
     if how == b"ascii":
         columns = _ascii(Lines(path, data[start:], line), row, count)
@@ -45,6 +46,7 @@ def read(path: Path, data: bytes) -> Contents:
 
 
 def _header(path: Path, data: bytes) -> tuple[dict[bytes, list[bytes]], int, int]:
+    """Parse the header: its words by key, the start of the data, and the line number there."""
     header: dict[bytes, list[bytes]] = {}
     start, number = 0, 0
     while b"DATA" not in header:
@@ -64,6 +66,7 @@ def _header(path: Path, data: bytes) -> tuple[dict[bytes, list[bytes]], int, int
 
 
 def _row(header: dict[bytes, list[bytes]]) -> np.dtype:
+    """Build the NumPy type of one point from FIELDS, SIZE, TYPE and COUNT."""
     fields: list[tuple] = []
     letters = {b"F": "f", b"U": "u", b"I": "i"}
     counts = header.get(b"COUNT", [b"1"] * len(header[b"FIELDS"]))
@@ -75,6 +78,7 @@ def _row(header: dict[bytes, list[bytes]]) -> np.dtype:
 
 
 def _ascii(lines: Lines, row: np.dtype, count: int) -> dict[str, np.ndarray]:
+    """Read the columns of text points."""
     widths = [int(np.prod(row[name].shape)) for name in row.names or ()]
     if len(lines) > count:
         raise lines.fail(count, f"the end of the file after {count} points")
@@ -88,7 +92,7 @@ def _ascii(lines: Lines, row: np.dtype, count: int) -> dict[str, np.ndarray]:
 
 
 def _decompress(path: Path, data: bytes, row: np.dtype, count: int) -> dict[str, np.ndarray]:
-    """The columns one after the other, packed as a whole; before them their packed and unpacked sizes."""
+    """Unpack compressed points: two sizes, then all columns, one after the other, packed together."""
     packed, size = struct.unpack_from("<II", data) if len(data) >= 8 else (0, 0)
     if len(data) < 8 + packed or size != row.itemsize * count:
         raise MeshFileError(f"{path}: truncated or damaged: expected {row.itemsize * count} bytes of {count} points, "
@@ -104,16 +108,17 @@ def _decompress(path: Path, data: bytes, row: np.dtype, count: int) -> dict[str,
 
 
 def _lzf(path: Path, data: bytes, size: int) -> bytes:
-    """Unpack LZF, the format of Marc Lehmann's liblzf: runs of bytes as they are, and copies of what came before."""
+    """Unpack LZF, the format of liblzf: literal runs of bytes, and copies of earlier output."""
     out, at = bytearray(), 0
     try:
         while at < len(data):
             control = data[at]
             at += 1
-            if control < 32:             # so many bytes and one more as they are
+            if control < 32:             # a literal run of control + 1 bytes
                 out += data[at:at + control + 1]
                 at += control + 1
                 continue
+            # a copy: length and distance, both possibly in further bytes
             length, distance = control >> 5, (control & 31) << 8
             if length == 7:
                 length += data[at]
@@ -121,7 +126,7 @@ def _lzf(path: Path, data: bytes, size: int) -> bytes:
             length, distance, at = length + 2, distance + data[at] + 1, at + 1
             if distance > len(out) or len(out) + length > size:
                 raise IndexError
-            run = out[-distance:][:length]                   # a copy may overlap itself: then it repeats
+            run = out[-distance:][:length]                   # an overlapping copy repeats itself
             out += run if length <= distance else (run * (length // distance + 1))[:length]
     except IndexError:
         pass
@@ -131,19 +136,20 @@ def _lzf(path: Path, data: bytes, size: int) -> bytes:
 
 
 def _contents(columns: dict[str, np.ndarray]) -> Contents:
+    """Make points, normals and colours of the columns."""
     points = np.stack([columns[name] for name in "xyz"], axis=1).astype(np.float64)
     normals = colors = None
     if {"normal_x", "normal_y", "normal_z"} <= set(columns):
         normals = np.stack([columns[f"normal_{a}"] for a in "xyz"], axis=1).astype(np.float64)
     packed = next((columns[name] for name in ("rgb", "rgba") if name in columns), None)
-    if packed is not None and packed.dtype.itemsize == 4 and packed.ndim == 1:       # 0xrrggbb, maybe in a float
+    if packed is not None and packed.dtype.itemsize == 4 and packed.ndim == 1:       # 0xrrggbb, possibly as a float
         bits = np.ascontiguousarray(packed).view(np.uint32)
         colors = np.stack([(bits >> shift) & 255 for shift in (16, 8, 0)], axis=1) / 255
     return Contents(points, None, normals, colors)
 
 
 def encode(contents: Contents, double: bool) -> bytes:
-    """A binary PCD file."""
+    """Encode a binary PCD file."""
     packed = None
     if contents.colors is not None:
         packed = quantise_colors(contents.colors).astype(np.uint32) @ np.array([1 << 16, 1 << 8, 1], dtype=np.uint32)

@@ -1,4 +1,4 @@
-"""PLY: ascii and binary of either byte order, with colours and normals; everything else is skipped.
+"""Read and write PLY: ascii, and binary of either byte order, with colours and normals; the rest is skipped.
 
 Triangles come from polygons, from strips (`tristrips`), or from the grid of a range scanner (`range_grid`).
 """
@@ -36,13 +36,17 @@ _COLORS = (("red", "green", "blue"), ("r", "g", "b"), ("diffuse_red", "diffuse_g
 
 @dataclass(frozen=True)
 class Property:
+    """A property in the header of a PLY file."""
+
     name: str
     kind: str                        # numpy type code of the value or of the list's items
-    length_kind: str | None = None   # that of the list's length, None for a single value
+    length_kind: str | None = None   # type code of the list's length, None for a single value
 
 
 @dataclass(frozen=True)
 class Element:
+    """An element in the header of a PLY file: rows with the same properties."""
+
     name: str
     count: int
     properties: tuple[Property, ...]
@@ -52,7 +56,7 @@ _Column = np.ndarray | tuple[np.ndarray, np.ndarray]     # values, or the length
 
 
 def read(path: Path, data: bytes) -> Contents:
-    """The vertices, triangles, normals and colours of a PLY file."""
+    """Read vertices, triangles, normals and colours of a PLY file."""
     order, elements, start, first_line = _header(path, data)
     names = [e.name for e in elements]
     if "vertex" not in names or len(set(names)) < len(names):
@@ -73,13 +77,13 @@ def read(path: Path, data: bytes) -> Contents:
 
 
 def _header(path: Path, data: bytes) -> tuple[str, list[Element], int, int]:
-    """Byte order, elements, and the place and line number where the body begins."""
+    """Parse the header: byte order, elements, and position and line number of the body."""
     if not data.startswith(b"ply") or data[3:4] not in (b"\n", b"\r"):
         raise MeshFileError(f"{path}: expected a PLY file that begins with 'ply', found {quote(data[:20])}")
     last_line = re.search(rb"[\r\n]end_header[ \t]*(\r\n|\r|\n)", data)
     if last_line is None:
         raise MeshFileError(f"{path}: truncated: the PLY header has no end_header")
-    # some programs end this line as no other; only where all end in CR alone is LF behind it a byte of the body
+    # if all other lines end in CR alone, an LF behind this one belongs to the body
     alone = data[3:4] == b"\r" and data[4:5] != b"\n" and last_line[1] == b"\r\n"
     after = last_line.end() - alone
     order, elements, lines = None, [], data[:last_line.start() + 1].splitlines()
@@ -108,6 +112,7 @@ def _header(path: Path, data: bytes) -> tuple[str, list[Element], int, int]:
 
 
 def _property(words: list[bytes]) -> Property:
+    """Parse a property line."""
     text = [w.decode() for w in words]
     if text[1] == "list":
         if _TYPES[text[2]][0] == "f":
@@ -118,7 +123,7 @@ def _property(words: list[bytes]) -> Property:
 
 def _binary_element(path: Path, data: bytes, element: Element, start: int, order: str
                     ) -> tuple[dict[str, _Column], int]:
-    """All rows at once when every list has the length it has in the first row, else row by row."""
+    """Read all rows at once if every list has the length of the first row, else row by row."""
     fields, at = list[tuple](), start
     for i, p in enumerate(element.properties):
         n = 1
@@ -132,6 +137,7 @@ def _binary_element(path: Path, data: bytes, element: Element, start: int, order
         at += n * int(p.kind[1])
         if at > len(data) and element.count:
             raise _truncation(path, element, 0)
+    # the type of one row, with list lengths as in the first; check that all rows have them
     row = np.dtype(fields)
     if start + row.itemsize * element.count > len(data):
         return _binary_rows(path, data, element, start, order)
@@ -150,6 +156,7 @@ def _binary_element(path: Path, data: bytes, element: Element, start: int, order
 
 def _binary_rows(path: Path, data: bytes, element: Element, start: int, order: str
                  ) -> tuple[dict[str, _Column], int]:
+    """Read rows with lists of varying lengths, one by one."""
     sizes, items = [list[int]() for _ in element.properties], [bytearray() for _ in element.properties]
     for row in range(element.count):
         for p, size, item in zip(element.properties, sizes, items, strict=True):
@@ -173,16 +180,18 @@ def _binary_rows(path: Path, data: bytes, element: Element, start: int, order: s
 
 
 def _length(data: bytes, at: int, kind: str, order: str) -> int:
+    """Read the length of a list."""
     return int.from_bytes(data[at:at + int(kind[1])], "big" if order == ">" else "little", signed=kind[0] == "i")
 
 
 def _truncation(path: Path, element: Element, found: int) -> MeshFileError:
+    """Make the error for missing rows."""
     return MeshFileError(f"{path}: truncated: expected {element.count} rows of element {element.name}, "
                          f"found {found}")
 
 
 def ascii_element(lines: Lines, element: Element, start: int) -> tuple[dict[str, _Column], int]:
-    """All rows at once where there are no lists, or one of whole numbers that has always the same length."""
+    """Read all rows at once without lists, or with one integer list of constant length; else row by row."""
     stop = start + element.count
     if stop > len(lines):
         raise _truncation(lines.path, element, max(len(lines) - start, 0))
@@ -200,6 +209,7 @@ def ascii_element(lines: Lines, element: Element, start: int) -> tuple[dict[str,
 
 
 def _ascii_rows(lines: Lines, element: Element, rows: range) -> dict[str, _Column]:
+    """Read text rows with lists of varying lengths, one by one."""
     sizes, items = [list[int]() for _ in element.properties], [list[float]() for _ in element.properties]
     for row in rows:
         words = iter(lines.text[row].split())
@@ -221,9 +231,11 @@ def _ascii_rows(lines: Lines, element: Element, rows: range) -> dict[str, _Colum
 
 
 def _contents(path: Path, vertex: Element, found: dict[str, dict[str, _Column]], grid_rows: int) -> Contents:
+    """Make the contents of the columns of all elements."""
     columns = found["vertex"]
 
     def triple(names: tuple[str, ...]) -> np.ndarray | None:
+        """Return three columns (N, 3), or None if one is missing."""
         values = [columns.get(name) for name in names]
         if any(v is None or isinstance(v, tuple) for v in values):
             return None
@@ -234,20 +246,20 @@ def _contents(path: Path, vertex: Element, found: dict[str, dict[str, _Column]],
         raise MeshFileError(f"{path}: expected properties x, y, z of element vertex, "
                             f"found {[p.name for p in vertex.properties]}")
     kinds = {p.name: np.dtype(p.kind) for p in vertex.properties}
-    # bytes are whole numbers of 255; other integers and floats may be of any scale
+    # integer colours are multiples of 1/255 or 1/65535; floats may have any scale
     colors = next((as_colors(c, kinds[names[0]].kind in "iu") for names in _COLORS if (c := triple(names)) is not None),
                   None)
     return Contents(vertices, _faces(path, found, vertices, grid_rows), triple(("nx", "ny", "nz")), colors)
 
 
 def _faces(path: Path, found: dict[str, dict[str, _Column]], vertices: np.ndarray, grid_rows: int) -> np.ndarray | None:
-    """(F, 3) triangles of the first of these elements that holds anything; None of a cloud."""
+    """Return triangles (F, 3) of the first non-empty element of faces, strips or grid; None for a cloud."""
     for name in ("face", "tristrips", "range_grid"):
         lists = found.get(name, {}).get("vertex_indices", found.get(name, {}).get("vertex_index"))
         if name not in found or (isinstance(lists, tuple) and not len(lists[0])):
             continue
         if not isinstance(lists, tuple):
-            if not any(map(len, found[name].values())):              # an element without rows need not say what it has
+            if not any(map(len, found[name].values())):              # an element without rows needs no such property
                 continue
             raise MeshFileError(f"{path}: expected a property list vertex_indices of element {name}, "
                                 f"found {list(found[name])}")
@@ -260,14 +272,14 @@ def _faces(path: Path, found: dict[str, dict[str, _Column]], vertices: np.ndarra
 
 
 def _strips(sizes: np.ndarray, corners: np.ndarray) -> np.ndarray:
-    """(F, 3) triangles of strips; a strip ends with its list, or at a -1 in it."""
+    """Return triangles (F, 3) of strips; a strip ends with its list, or at a -1 in it."""
     strip = np.repeat(np.arange(len(sizes)), sizes) + np.cumsum(corners < 0)
     listed = corners >= 0
     return strip_triangles(corners[listed].astype(np.int64), np.unique(strip[listed], return_counts=True)[1])
 
 
 def _grid(path: Path, sizes: np.ndarray, corners: np.ndarray, rows: int, vertices: np.ndarray) -> np.ndarray:
-    """(F, 3) triangles between neighbours in the grid of a range scanner, whose cells hold one vertex or none."""
+    """Triangulate the grid of a range scanner (F, 3), whose cells hold one vertex or none."""
     if rows <= 0 or len(sizes) % rows or not np.isin(sizes, (0, 1)).all():
         raise MeshFileError(f"{path}: expected a range_grid of one vertex or none a cell, and obj_info num_rows and "
                             f"num_cols that agree with its {len(sizes)} cells; found {rows} rows")
@@ -278,19 +290,19 @@ def _grid(path: Path, sizes: np.ndarray, corners: np.ndarray, rows: int, vertice
     numbers[sizes == 1] = corners
     cells: np.ndarray = numbers.reshape(rows, -1)
     a, b, c, d = (part.ravel() for part in (cells[:-1, :-1], cells[:-1, 1:], cells[1:, 1:], cells[1:, :-1]))
-    # two triangles a square, along its shorter diagonal; where a corner is missing the one that is left
+    # two triangles per square, along its shorter diagonal; one if a corner is missing
     shorter = np.linalg.norm(vertices[a] - vertices[c], axis=1) <= np.linalg.norm(vertices[b] - vertices[d], axis=1)
     along_ac = (shorter & (a >= 0) & (c >= 0)) | (b < 0) | (d < 0)
     faces = np.where(along_ac[:, None, None], np.stack([[a, d, c], [a, c, b]]).transpose(2, 0, 1),
                      np.stack([[a, d, b], [b, d, c]]).transpose(2, 0, 1)).reshape(-1, 3)
     faces = faces[(faces >= 0).all(axis=1)]
     longest = np.linalg.norm(vertices[faces] - vertices[np.roll(faces, 1, axis=1)], axis=2).max(axis=1, initial=0)
-    # range scanners look along -z, whichever way their rows run
+    # orient towards +z: range scanners look along -z, whatever the direction of their rows
     a, b, c = vertices[faces].transpose(1, 0, 2)
     if np.cross(b - a, c - a)[:, 2].sum() < 0:
         faces = faces[:, ::-1]
-    # of the edges between neighbours of a range scan, against their median: what is longer spans a jump from one
-    # surface to another. Triangles seen at 75 degrees have edges four times as long as those seen from the front
+    # edges longer than four medians span a jump between surfaces: triangles seen at 75 degrees have edges four times as
+    # long as those seen from the front
     kept = longest <= 4.0 * np.median(longest) if len(longest) else np.zeros(0, bool)
     warnings.warn(f"{path}: a range grid of {rows} x {cells.shape[1]}: neighbours were joined by {kept.sum()} "
                   f"triangles, {len(kept) - kept.sum()} that span jumps were left out", stacklevel=2)
@@ -298,7 +310,7 @@ def _grid(path: Path, sizes: np.ndarray, corners: np.ndarray, rows: int, vertice
 
 
 def encode(contents: Contents, double: bool) -> bytes:
-    """A binary little-endian PLY file; coordinates as `double` or, smaller, as `float`."""
+    """Encode a binary little-endian PLY file; coordinates as `double` or, smaller, as `float`."""
     number = "f8" if double else "f4"
     rows = as_rows([(("x", "y", "z"), number, contents.vertices), (("nx", "ny", "nz"), number, contents.normals),
                        (_COLORS[0], "u1", None if contents.colors is None else quantise_colors(contents.colors))])

@@ -1,4 +1,4 @@
-"""STL, ascii and binary. Each triangle has its own corners there; equal ones become one vertex."""
+"""Read and write STL, ascii and binary. Triangles have their own corners; equal ones become one vertex."""
 from __future__ import annotations
 
 import contextlib
@@ -9,12 +9,12 @@ import numpy as np
 
 from .format_common import Contents, Lines, MeshFileError, quote
 
-_HEADER = 80
+_HEADER = 80             # bytes of free text before the count
 _FACET = np.dtype([("normal", "<f4", (3,)), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
 
 
 def read(path: Path, data: bytes) -> Contents:
-    """The triangles of an STL file; corners with the very same coordinates are one vertex, in order of use."""
+    """Read the triangles of an STL file; corners with equal coordinates become one vertex, in order of use."""
     corners = _ascii(path, data) if _is_ascii(data) else _binary(path, data)
     rows = np.ascontiguousarray(corners.reshape(-1, 3) + 0.0)            # + 0.0: minus zero is zero
     _, first, of_corner = np.unique(rows.view(np.dtype((np.void, 24))).ravel(), return_index=True,
@@ -25,19 +25,20 @@ def read(path: Path, data: bytes) -> Contents:
 
 
 def _is_ascii(data: bytes) -> bool:
-    """Binary files may begin with 'solid' too; the zeros of their numbers, or their length, give them away."""
+    """Test for ascii: binary files may also begin with 'solid', but contain zero bytes or have the expected length."""
     if data.lstrip()[:5].lower() != b"solid":
         return False
     return len(data) != _length(data) and b"\0" not in data[:_HEADER + 4 + 10 * _FACET.itemsize]
 
 
 def _length(data: bytes) -> int:
-    """The length of a binary file according to its count of triangles."""
+    """Return the length of a binary file according to its count of triangles."""
     count = int(np.frombuffer(data, "<u4", 1, _HEADER)[0]) if len(data) >= _HEADER + 4 else 0
     return _HEADER + 4 + count * _FACET.itemsize
 
 
 def _binary(path: Path, data: bytes) -> np.ndarray:
+    """Read the corners (F, 3, 3) of a binary file."""
     if len(data) < _HEADER + 4:
         raise MeshFileError(f"{path}: expected an STL file, ascii or with a header of {_HEADER + 4} bytes, "
                             f"found {len(data)} bytes {quote(data[:20])}")
@@ -56,6 +57,7 @@ def _binary(path: Path, data: bytes) -> np.ndarray:
 
 
 def _ascii(path: Path, data: bytes) -> np.ndarray:
+    """Read the corners (F, 3, 3) of a text file."""
     lines = Lines(path, data)
     starts = [line.lstrip()[:8].lower().split()[0] for line in lines.text]
     rows = [i for i, word in enumerate(starts) if word == b"vertex"]
@@ -75,6 +77,7 @@ def _ascii(path: Path, data: bytes) -> np.ndarray:
 
 
 def _is_vertex(line: bytes) -> bool:
+    """Test whether a line holds three numbers."""
     try:
         return len([float(word) for word in line.split()]) == 3
     except ValueError:
@@ -82,7 +85,7 @@ def _is_vertex(line: bytes) -> bool:
 
 
 def encode(contents: Contents, double: bool) -> bytes:
-    """A binary STL file, which holds single precision whatever `double` says."""
+    """Encode a binary STL file, always in single precision."""
     assert contents.faces is not None, "an STL file is made of triangles"
     corners = contents.vertices[contents.faces]
     normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])

@@ -1,4 +1,4 @@
-"""Formats of text: Wavefront OBJ; OFF with its variants COFF, NOFF, CNOFF; and points, one `x y z` a line."""
+"""Read and write text formats: Wavefront OBJ; OFF, COFF, NOFF, CNOFF; and points, one `x y z` per line."""
 from __future__ import annotations
 
 import re
@@ -23,7 +23,7 @@ from .format_ply import Element, Property, ascii_element
 
 
 def read_obj(path: Path, data: bytes) -> Contents:
-    """The vertices, in their order, triangles and vertex colours of an OBJ file; everything else is skipped."""
+    """Read vertices, triangles and vertex colours of an OBJ file; everything else is skipped."""
     lines = Lines(path, as_utf8(data).replace(b"\\\r\n", b" ").replace(b"\\\n", b" "), comment=b"#")
     starts = [line[:2] for line in map(bytes.lstrip, lines.text)]
     v_rows = [row for row, start in enumerate(starts) if start in (b"v ", b"v\t")]
@@ -39,7 +39,7 @@ def read_obj(path: Path, data: bytes) -> Contents:
 
 
 def _objects(lines: Lines, o_rows: list[int], f_rows: list[int], sizes: np.ndarray) -> tuple[tuple[str, int], ...]:
-    """Name and triangles of every object that has any; one object need not be named."""
+    """Return name and triangle count of every non-empty object; the first may have no name."""
     of = np.searchsorted(o_rows, f_rows) - 1
     names = [text.strip().decode("utf-8", "replace") for text in _after(lines, o_rows)]
     counts = [(name, int((sizes[of == k] - 2).sum())) for k, name in enumerate(["without a name", *names], -1)]
@@ -47,19 +47,19 @@ def _objects(lines: Lines, o_rows: list[int], f_rows: list[int], sizes: np.ndarr
 
 
 def _after(lines: Lines, rows: list[int]) -> list[bytes]:
-    """What follows the keyword, one letter, on these rows."""
+    """Return what follows the one-letter keyword on these rows."""
     return [lines.text[row].lstrip()[1:] for row in rows]
 
 
 def _vertices(lines: Lines, rows: list[int]) -> np.ndarray:
-    """(N, 3) coordinates, or (N, 6) and more where every line has a colour as well."""
+    """Read coordinates (N, 3), or (N, 6) if every line also has a colour."""
     text = _after(lines, rows)
     try:
         table = np.loadtxt(text, ndmin=2, comments=None) if any(map(bytes.strip, text)) else np.zeros((0, 3))
         if len(table) != len(rows) or table.shape[1] < 3:
             raise ValueError
         return table[:, :6 if table.shape[1] >= 6 else 3]
-    except ValueError:               # lines of unequal length, or one that is wrong
+    except ValueError:               # lines of unequal length, or a bad one
         out = []
         for row, line in zip(rows, text, strict=True):
             try:
@@ -71,7 +71,7 @@ def _vertices(lines: Lines, rows: list[int]) -> np.ndarray:
 
 
 def _corners(lines: Lines, v_rows: list[int], f_rows: list[int]) -> tuple[np.ndarray, np.ndarray]:
-    """The vertices of all faces one after the other, counted from 0, and how many each face has."""
+    """Read the vertices of all faces, one after the other, counted from 0; and the number of each face."""
     text = _after(lines, f_rows)
     if any(b"/" in line for line in text):           # v/vt/vn: the first number is the vertex
         text = re.sub(rb"/\S*", b"", b"\n".join(text)).split(b"\n")
@@ -82,7 +82,7 @@ def _corners(lines: Lines, v_rows: list[int], f_rows: list[int]) -> tuple[np.nda
         if len(table) != len(text):
             raise ValueError
         corners, sizes = table.astype(np.int64).ravel(), np.full(len(text), table.shape[1])
-    except (ValueError, OverflowError):      # polygons of several sizes, or one that is wrong
+    except (ValueError, OverflowError):      # polygons of several sizes, or a bad line
         words = [line.split() for line in text]
         bad = next((i for i, w in enumerate(words) if not all(re.fullmatch(rb"[+-]?\d{1,18}", x) for x in w)), None)
         if bad is not None:
@@ -93,12 +93,12 @@ def _corners(lines: Lines, v_rows: list[int], f_rows: list[int]) -> tuple[np.nda
     if len(zero):
         face = int(np.searchsorted(np.cumsum(sizes), zero[0], side="right"))
         raise lines.fail(f_rows[face], "vertex numbers counted from 1")
-    known = np.repeat(np.searchsorted(v_rows, f_rows), sizes)      # a negative number counts back from here
+    known = np.repeat(np.searchsorted(v_rows, f_rows), sizes)      # negative numbers count back from here
     return np.where(corners < 0, known + corners, corners - 1), sizes
 
 
 def encode_obj(contents: Contents, double: bool) -> bytes:
-    """An OBJ file; colours, when there are any, behind the coordinates."""
+    """Encode an OBJ file; colours, if any, follow the coordinates."""
     form, columns = f"v {three_numbers(double)}", [contents.vertices]
     if contents.colors is not None:
         form, columns = form + " %.4g %.4g %.4g", [contents.vertices, contents.colors]
@@ -107,13 +107,13 @@ def encode_obj(contents: Contents, double: bool) -> bytes:
 
 
 def read_off(path: Path, data: bytes) -> Contents:
-    """The vertices, polygons as triangles, normals and vertex colours of an OFF file in ascii."""
+    """Read vertices, polygons as triangles, normals and vertex colours of an ascii OFF file."""
     lines = Lines(path, as_utf8(data), comment=b"#")
     head = lines.text[0].split() if len(lines) else [b""]
     kind = re.match(rb"(ST)?(C)?(N)?OFF(?=\d|$)", head[0])
     if kind is None:
         raise MeshFileError(f"{path}: expected a file that begins with OFF or COFF, found {quote(data[:20])}")
-    if kind.end() < len(head[0]):            # the counts are glued to it, as in ModelNet40
+    if kind.end() < len(head[0]):            # the counts follow without a space, as in ModelNet40
         head[:1] = [kind[0], head[0][kind.end():]]
     if head[1:2] == [b"BINARY"]:
         raise MeshFileError(f"{path}: expected an ascii OFF file, found a binary one")
@@ -133,14 +133,14 @@ def read_off(path: Path, data: bytes) -> Contents:
         found = len(lines) - place
         raise MeshFileError(f"{path}: {'truncated: ' if found < f else ''}expected {f} faces after {n} vertices, "
                             f"found {found} lines")
-    face = Element("face", f, (Property("corners", "i4", "u1"),))                 # as in PLY; what follows is skipped
+    face = Element("face", f, (Property("corners", "i4", "u1"),))                 # as in PLY; face colours are skipped
     sizes, corners = ascii_element(lines, face, place)[0]["corners"]
     faces = polygons(path, sizes, corners, n, lines.numbers[place:place + f], table[:, :3])
     return Contents(table[:, :3], faces, table[:, 3:6] if kind[3] else None, colors)
 
 
 def _one_face_a_line(lines: Lines, place: int, count: int) -> None:
-    """Join the lines from `place` on where faces go on over several, if they are `count` faces and no more."""
+    """Join lines from `place` on, if faces span several lines and are exactly `count`."""
     words, faces, at = [word for line in lines.text[place:] for word in line.split()], list[bytes](), 0
     for _ in range(count):
         if at >= len(words) or not words[at].isdigit() or len(words[at]) > 9:
@@ -153,7 +153,7 @@ def _one_face_a_line(lines: Lines, place: int, count: int) -> None:
 
 
 def encode_off(contents: Contents, double: bool) -> bytes:
-    """An OFF file, or COFF where there are colours."""
+    """Encode an OFF file, or COFF with colours."""
     assert contents.faces is not None, "an OFF file is written for meshes"
     kind, form, columns = "OFF", three_numbers(double), [contents.vertices]
     if contents.colors is not None:
@@ -163,7 +163,7 @@ def encode_off(contents: Contents, double: bool) -> bytes:
             + text_rows("3 %d %d %d", contents.faces)).encode()
 
 
-# names of columns in headings of CloudCompare, ParaView, MeshLab and others, without marks and units
+# column names of CloudCompare, ParaView, MeshLab and others, without punctuation and units
 _COLUMNS = {"points": {"x": "x", "y": "y", "z": "z", "points0": "x", "points1": "y", "points2": "z"},
             "normals": {"nx": "x", "ny": "y", "nz": "z", "normalx": "x", "normaly": "y", "normalz": "z",
                         "normals0": "x", "normals1": "y", "normals2": "z"},
@@ -171,17 +171,17 @@ _COLUMNS = {"points": {"x": "x", "y": "y", "z": "z", "points0": "x", "points1": 
 
 
 def read_xyz(path: Path, data: bytes) -> Contents:
-    """The points of a text file, with columns parted by spaces, commas or semicolons.
+    """Read the points of a text file with columns separated by spaces, commas or semicolons.
 
-    A heading tells which columns are what. Without one the first three are coordinates; three more are normals when
-    every row of them has length one, colours when they are 0..255 or 0..1, else anything. In `.pts` an intensity may
-    stand before the colours. A line of one number is a count of points.
+    A heading names the columns. Without one the first three are coordinates. Three more are normals if every row has
+    length one, or colours if they are in 0..255 or 0..1. In `.pts` an intensity may precede the colours. A line with a
+    single number is a count of points.
     """
     data = as_utf8(data)
     if b"\0" in data:
         raise MeshFileError(f"{path}: expected text with lines 'x y z', found a binary file")
     lines = Lines(path, data, comment=b"#")
-    # a heading, a count, or both in either order stand above the points
+    # a heading, a count, or both in any order may precede the points
     first, names = 0, list[str]()
     while first < min(len(lines), 2) and not _is_point(lines.text[first]):
         words = [re.sub(r"[\[(].*|[^a-z0-9]", "", word) for word in _words(lines.text[first].decode("latin-1").lower())]
@@ -196,7 +196,7 @@ def read_xyz(path: Path, data: bytes) -> Contents:
     table = lines.table(range(first, len(lines)), "numbers 'x y z', as many on every line", 3)
     if names:
         return _columns_by_name(lines, names, table)
-    # normals and colours among the columns from `start` on; a column that begins neither is skipped
+    # find normals and colours among the columns from `start` on; skip columns that begin neither
     start = 4 if path.name.lower().endswith(".pts") and table.shape[1] in (4, 7) else 3
     normals = colors = None
     while start + 3 <= table.shape[1]:
@@ -211,10 +211,12 @@ def read_xyz(path: Path, data: bytes) -> Contents:
 
 
 def _words(line: str) -> list[str]:
+    """Split a line at spaces, commas and semicolons."""
     return [word for word in re.split(r"[\s,;]+", line) if word] or [""]
 
 
 def _is_point(line: bytes) -> bool:
+    """Test whether a line holds three numbers or more."""
     try:
         return len([float(word) for word in re.split(rb"[\s,;]+", line) if word]) >= 3
     except ValueError:
@@ -222,10 +224,10 @@ def _is_point(line: bytes) -> bool:
 
 
 def _with_decimal_points(lines: Lines, first: int) -> list[bytes]:
-    """The lines from `first` on with spaces between columns and points in numbers.
+    """Convert lines from `first` on to columns separated by spaces, with decimal points.
 
-    A comma is that of decimals where at least three words with at most one comma inside stand on every line, and no
-    point; otherwise it parts columns.
+    A comma is a decimal comma if every line has at least three words, each with at most one comma inside, and there is
+    no point. Otherwise it separates columns.
     """
     body = b"\n".join(lines.text[first:]).replace(b";", b" ")
     if b"," in body:
@@ -241,7 +243,7 @@ def _with_decimal_points(lines: Lines, first: int) -> list[bytes]:
 
 
 def _columns_by_name(lines: Lines, names: list[str], table: np.ndarray) -> Contents:
-    """The columns that a heading names; MeshFileError where it does not name x, y and z or has other columns."""
+    """Select columns by the heading; MeshFileError if it lacks x, y or z, or has too many columns."""
     if len(names) > table.shape[1]:
         raise lines.fail(0, f"a heading of {table.shape[1]} columns, as the points have")
     found = {}
@@ -256,7 +258,7 @@ def _columns_by_name(lines: Lines, names: list[str], table: np.ndarray) -> Conte
 
 
 def encode_xyz(contents: Contents, double: bool) -> bytes:
-    """Lines of coordinates, then normals, then colours 0..255."""
+    """Encode lines of coordinates, then normals, then colours 0..255."""
     form, columns = three_numbers(double), [contents.vertices]
     if contents.normals is not None:
         form, columns = form + " %.7g %.7g %.7g", [*columns, contents.normals]

@@ -1,4 +1,4 @@
-"""Formats in XML: COLLADA (`.dae`), and 3MF, a zip with XML in it. All triangles of the scene, each at its place."""
+"""Read XML formats: COLLADA (`.dae`), and 3MF, a zip with XML. All triangles of the scene, in scene coordinates."""
 from __future__ import annotations
 
 import io
@@ -14,15 +14,15 @@ from . import rotations, storage
 from .format_common import Contents, MeshFileError, polygons, strip_triangles
 
 _METRES = {"micron": 1e-6, "millimeter": 1e-3, "centimeter": 1e-2, "inch": 0.0254, "foot": 0.3048, "meter": 1.0}
-_DEEPEST = 100               # nodes below nodes, components of components
+_DEEPEST = 100               # deepest nesting of nodes or components; stops cycles
 
 
 @dataclass
 class _Scene:
-    """What is gathered of a file; a mesh that is shown often is held once for each time, but not without end."""
+    """Collects the meshes of a file; every instance is a copy, up to a limit."""
 
     path: Path
-    most: int                                           # vertices and corners that a file of its size may show
+    most: int                                           # vertices and corners allowed for a file of this size
     vertices: list[np.ndarray] = field(default_factory=list)
     faces: list[np.ndarray] = field(default_factory=list)
     colors: list[np.ndarray | None] = field(default_factory=list)
@@ -30,6 +30,7 @@ class _Scene:
 
     def add(self, name: str, vertices: np.ndarray, faces: np.ndarray, matrix: np.ndarray,
             colors: np.ndarray | None = None) -> None:
+        """Add one instance of a mesh, transformed by a matrix (4, 4)."""
         start = sum(map(len, self.vertices))
         self.most -= len(vertices) + 3 * len(faces) + 1
         if self.most < 0:
@@ -42,6 +43,7 @@ class _Scene:
         self.objects.append((name, len(faces)))
 
     def contents(self, metres: float) -> Contents:
+        """Return all meshes as one; colours only if all have them."""
         if not sum(map(len, self.faces)):
             raise MeshFileError(f"{self.path}: expected a mesh, found no triangles")
         shades = [c for c in self.colors if c is not None]
@@ -51,7 +53,7 @@ class _Scene:
 
 
 def _parse(data: bytes) -> ElementTree.Element:
-    """The root of a document, names without their namespaces."""
+    """Parse a document; return its root, with names without namespaces."""
     if b"<!ENTITY" in data:
         raise ValueError("it declares entities of its own, which no mesh needs")
     root = ElementTree.fromstring(data)
@@ -63,16 +65,16 @@ def _parse(data: bytes) -> ElementTree.Element:
 
 
 def _numbers(text: str | None, kind: type = np.float64) -> np.ndarray:
-    """The numbers of a list; some programs write them as their country does, with commas."""
+    """Parse a list of numbers; some programs write decimal commas."""
     return np.array((text or "").replace(",", ".").split(), dtype=kind)
 
 
 # ---- COLLADA
 
 def read_dae(path: Path, data: bytes) -> Contents:
-    """The meshes of the scene of a COLLADA file in the unit that it names; lines are left out.
+    """Read the meshes of the scene of a COLLADA file in its own unit; lines are left out.
 
-    A mesh on joints is where it was bound to them.
+    Skinned meshes are in their bind pose.
     """
     with storage.taking_apart(path, "a whole COLLADA file", MeshFileError), np.errstate(all="ignore"):
         root = _parse(data)
@@ -91,13 +93,13 @@ def read_dae(path: Path, data: bytes) -> Contents:
 
 def _follow_link(ids: dict[str, ElementTree.Element], element: ElementTree.Element, key: str = "url"
                  ) -> ElementTree.Element:
-    """The element that another one points to."""
+    """Return the element that another one refers to."""
     return ids[element.attrib[key].removeprefix("#")]
 
 
 def _instances(node: ElementTree.Element, matrix: np.ndarray, ids: dict[str, ElementTree.Element], depth: int
                ) -> Iterator[tuple[ElementTree.Element, str, np.ndarray]]:
-    """The geometries below a node, their names, and the matrices (4, 4) from each to the scene."""
+    """Yield the geometries below a node, with name and matrix (4, 4) to the scene."""
     if depth > _DEEPEST:
         raise ValueError("its nodes hang below each other without end")
     for child in node:
@@ -117,7 +119,7 @@ def _instances(node: ElementTree.Element, matrix: np.ndarray, ids: dict[str, Ele
 
 
 def _matrix(element: ElementTree.Element) -> np.ndarray:
-    """(4, 4) of one of the transforms of a node, which follow one another; of anything else the identity."""
+    """Return the matrix (4, 4) of one transform element of a node; the identity for any other element."""
     M = np.eye(4)
     if element.tag == "matrix":
         return _numbers(element.text).reshape(4, 4)
@@ -135,7 +137,7 @@ def _matrix(element: ElementTree.Element) -> np.ndarray:
 
 def _geometry(path: Path, geometry: ElementTree.Element, ids: dict[str, ElementTree.Element]
               ) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
-    """The vertices (N, 3), triangles (F, 3) and colours (N, 3), if all have one, of a geometry."""
+    """Read vertices (N, 3), triangles (F, 3) and, if all vertices have them, colours (N, 3) of a geometry."""
     mesh = geometry.find("mesh")
     if mesh is None:
         raise ValueError(f"geometry {geometry.get('id')!r} is no mesh")
@@ -145,6 +147,7 @@ def _geometry(path: Path, geometry: ElementTree.Element, ids: dict[str, ElementT
     for primitive in mesh:
         if primitive.tag not in ("triangles", "polylist", "polygons", "tristrips", "trifans"):
             continue
+        # corners of a primitive interleave the indices of several inputs: pick those of vertices and colours
         inputs = {str(i.get("semantic")): (int(i.get("offset", 0)), i) for i in primitive.iterfind("input")}
         first, width = inputs["VERTEX"][0], max(offset for offset, _ in inputs.values()) + 1
         rows = [_numbers(p.text, np.int64) for p in primitive.iter("p")]
@@ -169,7 +172,7 @@ def _geometry(path: Path, geometry: ElementTree.Element, ids: dict[str, ElementT
 
 
 def _source(ids: dict[str, ElementTree.Element], element: ElementTree.Element) -> np.ndarray:
-    """(n, 3) the first three of every row of numbers that an input points to."""
+    """Read the first three numbers (n, 3) of every row of the source of an input."""
     accessor = _follow_link(ids, element, "source").find("technique_common/accessor")
     if accessor is None:
         raise ValueError("a source without accessor")
@@ -181,8 +184,8 @@ def _source(ids: dict[str, ElementTree.Element], element: ElementTree.Element) -
 # ---- 3MF
 
 def read_3mf(path: Path, data: bytes) -> Contents:
-    """The meshes that a 3MF file builds, in the unit that it names; supports are left out."""
-    unpacked = 100  # bytes of XML for one of a zip: meshes have about ten
+    """Read the meshes that a 3MF file builds, in its own unit; supports are left out."""
+    unpacked = 100  # largest packing ratio; meshes have about ten, more is a decompression bomb
     with (storage.taking_apart(path, "a whole 3MF file", MeshFileError), np.errstate(all="ignore"),
           zipfile.ZipFile(io.BytesIO(data)) as archive):
         if sum(info.file_size for info in archive.infolist()) > 2**24 + unpacked * len(data):
@@ -193,13 +196,14 @@ def read_3mf(path: Path, data: bytes) -> Contents:
         scene, parts = _Scene(path, 10**6 + 4 * unpacked * len(data)), dict[str, ElementTree.Element]()
 
         def part(name: str) -> ElementTree.Element:
+            """Parse a part of the archive once."""
             key = "/" + name.lower().lstrip("/")
             if key not in parts:
                 parts[key] = _parse(archive.read(names[key]))
             return parts[key]
 
         def show(name: str, number: str, matrix: np.ndarray, depth: int) -> None:
-            """An object of a part of the file, or what it is made of."""
+            """Add an object and its components to the scene."""
             if depth > _DEEPEST:
                 raise ValueError("its components hang below each other without end")
             thing = next(e for e in part(name).iterfind("resources/object") if e.get("id") == number)
@@ -220,7 +224,7 @@ def read_3mf(path: Path, data: bytes) -> Contents:
 
 
 def _transform(element: ElementTree.Element) -> np.ndarray:
-    """(4, 4) of twelve numbers, which multiply rows."""
+    """Return the matrix (4, 4) of an element; its twelve numbers act on row vectors."""
     M = np.eye(4)
     if "transform" in element.attrib:
         M[:3] = _numbers(element.attrib["transform"]).reshape(4, 3).T
@@ -228,5 +232,6 @@ def _transform(element: ElementTree.Element) -> np.ndarray:
 
 
 def _table(elements: Iterator[ElementTree.Element], names: tuple[str, ...], kind: type) -> np.ndarray:
+    """Read attributes of elements as a table (n, k)."""
     rows = [[element.attrib[name] for name in names] for element in elements]
     return np.array(rows, dtype=kind).reshape(-1, len(names))

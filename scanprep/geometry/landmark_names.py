@@ -1,4 +1,4 @@
-"""The one list of landmark names: what people call the same place, in this program's files and in those of others."""
+"""Names of landmarks, with the synonyms that people and other programs use."""
 from __future__ import annotations
 
 import re
@@ -7,8 +7,8 @@ from typing import Any
 
 from .sides import split_side
 
-# Our name of a place in the middle of the body or, without its side, on either side: then other names, in small
-# letters without side and punctuation: what people write, the SCAPE and SPRING meshes, CAESAR, ISO 7250.
+# Our name of a landmark, in the middle of the body or, without its side, on either side; then its synonyms in lower
+# case without side and punctuation: what people write, the SCAPE and SPRING meshes, CAESAR, ISO 7250.
 MIDDLE = {
     "top of head": ("crown", "head top", "head", "vertex", "apex"), "navel": ("belly button", "omphalion", "cornea"),
     "back": ("cornea on the back similar position",), "crotch": ("between two legs", "perineum"),
@@ -28,14 +28,14 @@ PAIRED = {
     "shoulder": ("shoulder upper side", "acromion", "shoulder top"),
     "armpit": ("shoulder bottom side", "axilla ant", "axilla"),
     "nipple": ("tit", "thelion bustpoint", "breast"), "eye": ("ectocanthus",), "ear": ("tragion",)}
-# The ten that README asks for: limbs have ends and bends there, and everybody finds them.
+# the ten landmarks that the README asks for: ends and bends of limbs, easy to find
 TEN = ("top of head", "navel", *(f"{side} {name}" for name in ("middle finger", "toe", "elbow outside", "knee")
                                  for side in ("left", "right")))
 _KNOWN = {form: name for names in (MIDDLE, PAIRED) for name, forms in names.items() for form in (name, *forms)}
 
 
 def landmark_name(name: str) -> str:
-    """Our name of a landmark, whatever its case, its spaces, how its side is told, and which synonym it is.
+    """Return our name of a landmark, for any case, spacing, spelling of the side, and synonym.
 
     Examples
     --------
@@ -54,20 +54,20 @@ def landmark_name(name: str) -> str:
 
 
 def translate_landmarks(landmarks: Mapping[str, Any]) -> dict[str, Any]:
-    """Landmarks by our names: `left knee` for `knee in left leg` or `Lt. Femoral Lateral Epicn.`.
+    """Rename landmarks to our names: `left knee` for `knee in left leg` or `Lt. Femoral Lateral Epicn.`.
 
-    Where several are names of one place, the one that is spelt as ours counts, else the first.
+    Of several names of one place, our spelling counts, else the first.
     """
     out: dict[str, Any] = {}
     for name, value in landmarks.items():
-        ours = landmark_name(name)
-        if ours not in out or name == ours:
-            out[ours] = value
+        our_name = landmark_name(name)
+        if our_name not in out or name == our_name:
+            out[our_name] = value
     return out
 
 
 def pair_names(ours: Iterable[str], theirs: Iterable[str]) -> list[tuple[str, str]]:
-    """The names (ours, theirs) of the same places, in our order: equal ones, then those that mean the same."""
+    """Pair names (ours, theirs) of the same places, in our order; equal names before synonyms."""
     theirs = list(theirs)
     same = set(ours) & set(theirs)
     by_meaning: dict[str, str] = {}

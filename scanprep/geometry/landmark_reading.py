@@ -1,4 +1,4 @@
-"""Landmarks in the files of other programs, each format as it stands; `landmark_writing` is the counterpart."""
+"""Read landmark files of other programs; `landmark_writing` is the counterpart."""
 from __future__ import annotations
 
 import csv
@@ -18,17 +18,17 @@ _Points = list[tuple[str, np.ndarray]]
 
 
 class LandmarkFile(NamedTuple):
-    """What a file says, in its order."""
+    """The contents of a landmark file, in its order."""
 
     pairs: list[tuple[str, Entry]]
-    unit: str | None = None                      # of the points, where the format or the file tells
-    flipped: bool = False                        # may be: 3D Slicer has LPS and RAS, and scans of either
+    unit: str | None = None                      # of the points, if the format or the file says
+    flipped: bool = False                        # x and y may have the other sign: 3D Slicer has LPS and RAS
 
 
 def entries_of(path: Path, data: bytes, unit: str | None) -> LandmarkFile:
-    """The landmarks of a file by its ending; `unit` is that which was told.
+    """Read the landmarks of a file, in the format of its ending; `unit` is the one that the caller gave.
 
-    MeshFileError with the line or the element that is wrong.
+    MeshFileError names the bad line or element.
     """
     suffix = path.suffix.lower()
     if suffix not in (".json", ".pp", ".xml") and b"\0" in data:
@@ -45,14 +45,14 @@ def entries_of(path: Path, data: bytes, unit: str | None) -> LandmarkFile:
         if suffix == ".csv":
             return LandmarkFile([*_table(Lines(path, data, comment=b"#"))])
         if suffix == ".lnd":
-            # number, two codes, distance from the axis, x, y, z and name, after a heading of `KEY = value`
+            # columns: number, two codes, distance from the axis, x, y, z, name; headings are `KEY = value`
             expected = "a line of a CAESAR .lnd file, seven numbers and a name"
             return LandmarkFile(_rows_with_names(Lines(path, data), 7, expected, "latin-1", b"="), "mm")
         return LandmarkFile(_rows_with_names(Lines(path, data, comment=b"#"), 3, "'x y z name'", "utf-8"))
 
 
 def _json(path: Path, data: bytes, unit: str | None) -> LandmarkFile:
-    """Ours, scalismo's, or a markups file of 3D Slicer."""
+    """Read JSON: our format, scalismo's, or a markups file of 3D Slicer."""
     tree = storage.parse_json(path, data, "landmarks", MeshFileError, nan=True)      # refused later, by name
     if isinstance(tree, list) and tree and all(isinstance(one, dict) and "id" in one for one in tree):
         return LandmarkFile([(str(one["id"]), _point(path, str(one["id"]), one.get("coordinates"))) for one in tree])
@@ -64,6 +64,7 @@ def _json(path: Path, data: bytes, unit: str | None) -> LandmarkFile:
 
 
 def _json_entry(path: Path, name: str, value: Any) -> Entry:
+    """Read one entry of our JSON: a point, a vertex, or a point of a face."""
     if isinstance(value, int) and not isinstance(value, bool):
         return value
     if isinstance(value, dict) and isinstance(value.get("face"), int) \
@@ -75,6 +76,7 @@ def _json_entry(path: Path, name: str, value: Any) -> Entry:
 
 
 def _point(path: Path, name: str, value: Any) -> np.ndarray:
+    """Read a point (3,); MeshFileError for anything else."""
     point = _numbers(value)
     if point is None:
         raise MeshFileError(f"{path}: landmark '{name}': expected [x, y, z], a vertex or "
@@ -83,6 +85,7 @@ def _point(path: Path, name: str, value: Any) -> np.ndarray:
 
 
 def _numbers(value: Any) -> np.ndarray | None:
+    """Return three numbers as an array (3,), or None."""
     try:
         point = np.array(value, dtype=np.float64)
     except (TypeError, ValueError, OverflowError):
@@ -91,7 +94,7 @@ def _numbers(value: Any) -> np.ndarray | None:
 
 
 def _slicer(path: Path, markups: list[Any], unit: str | None) -> LandmarkFile:
-    """The points of a markups file, in LPS."""
+    """Read the points of a markups file, in LPS."""
     pairs: list[tuple[str, Entry]] = []
     own_unit: Any = "mm"
     with storage.taking_apart(path, "a markups file of 3D Slicer", MeshFileError):
@@ -118,19 +121,19 @@ _FIDUCIALS_OLD = "label,x,y,z,sel,vis".split(",")            # of 3D Slicer 3
 
 
 def _fiducials(path: Path, data: bytes) -> LandmarkFile:
-    """The points of an .fcsv file of 3D Slicer, in LPS: without a word of the axes they are RAS."""
+    """Read the points of an .fcsv file of 3D Slicer, in LPS; a file that does not name its axes is RAS."""
     heading = [line.lstrip(b"# ").strip() for line in data.splitlines() if line.startswith(b"#")]
-    told = [line.split(b"=")[1].strip() for line in heading if re.match(rb"(?i)coordinatesystem *=", line)]
-    signs = {b"0": (-1, -1, 1), b"RAS": (-1, -1, 1), b"1": (1, 1, 1), b"LPS": (1, 1, 1)}.get(*told or [b"RAS"])
+    stated = [line.split(b"=")[1].strip() for line in heading if re.match(rb"(?i)coordinatesystem *=", line)]
+    signs = {b"0": (-1, -1, 1), b"RAS": (-1, -1, 1), b"1": (1, 1, 1), b"LPS": (1, 1, 1)}.get(*stated or [b"RAS"])
     if signs is None:
-        raise MeshFileError(f"{path}: expected CoordinateSystem = LPS or RAS (1 or 0), found {quote(told[0])}")
+        raise MeshFileError(f"{path}: expected CoordinateSystem = LPS or RAS (1 or 0), found {quote(stated[0])}")
     named = [line.split(b"=")[-1].strip().decode().split(",") for line in heading if b",x,y,z," in line + b","]
     pairs: _Points = []
     lines = Lines(path, b"\n".join(b"" if line.startswith(b"#") else line for line in data.splitlines()))
     for row in range(len(lines)):
         words = _cells(lines, row, ",")
         columns = named[0] if named else _FIDUCIALS if len(words) > len(_FIDUCIALS_OLD) else _FIDUCIALS_OLD
-        # what 3D Slicer 5 writes behind these columns of a point that was placed
+        # 3D Slicer 5 adds a status column: 2 for a placed point
         if len(words) > len(columns) == len(_FIDUCIALS) and words[len(columns)] != "2":
             continue
         pairs.append(_point_of_row(lines, row, dict(zip(columns, words, strict=False)), "label", ",".join(columns)))
@@ -138,7 +141,7 @@ def _fiducials(path: Path, data: bytes) -> LandmarkFile:
 
 
 def _meshlab(path: Path, data: bytes) -> _Points:
-    """Points of MeshLab's PickPoints; those of a template that were not picked are inactive and left out."""
+    """Read the points of MeshLab's PickPoints; inactive ones were not picked and are left out."""
     pairs = []
     with storage.taking_apart(path, "picked points of MeshLab with x, y, z and name", MeshFileError):
         for i, point in enumerate(ElementTree.fromstring(data).iter("point"), 1):
@@ -155,7 +158,7 @@ def _meshlab(path: Path, data: bytes) -> _Points:
 
 
 def _marker_set(path: Path, data: bytes) -> _Points:
-    """The markers of OpenSim, which must be in one frame: what others are on is known with its model only."""
+    """Read the markers of OpenSim; all must be in one frame, as other frames need its model."""
     markers = read_marker_set(path, data)
     frames = {frame: name for name, (frame, _) in reversed(markers.items())}
     if len(frames) > 1:
@@ -166,8 +169,8 @@ def _marker_set(path: Path, data: bytes) -> _Points:
 
 
 def read_marker_set(path: Path, data: bytes) -> dict[str, tuple[str, np.ndarray]]:
-    """Name -> the body or frame, and the place (3,) in it, metres, of every marker of OpenSim's; MeshFileError."""
-    found: dict[str, tuple[str, np.ndarray]] = {}
+    """Read an OpenSim marker set: name -> frame or body, and position (3,) in it, metres. MeshFileError if damaged."""
+    markers: dict[str, tuple[str, np.ndarray]] = {}
     with storage.taking_apart(path, "a MarkerSet of OpenSim", MeshFileError):
         for i, marker in enumerate(ElementTree.fromstring(data).iter("Marker"), 1):
             name = marker.get("name", "")
@@ -176,14 +179,14 @@ def read_marker_set(path: Path, data: bytes) -> dict[str, tuple[str, np.ndarray]
             if not name or frame is None or place is None:
                 lacking = "name" if not name else "socket_parent_frame or body" if frame is None else "location x y z"
                 raise ValueError(f"marker {i} {quote(name)} has no {lacking}")
-            if name in found:
+            if name in markers:
                 raise MeshFileError(f"{path}: landmark '{name}' comes twice")
-            found[name] = frame.strip().rpartition("/")[2], place
-    return found
+            markers[name] = frame.strip().rpartition("/")[2], place
+    return markers
 
 
 def _table(lines: Lines) -> _Points:
-    """Rows below a heading that has name (or label, landmark, id), x, y and z among its columns."""
+    """Read rows below a heading with name (or label, landmark, id), x, y and z among its columns."""
     if not len(lines):
         return []
     mark = max(",;\t", key=lambda sign: lines.text[0].count(sign.encode()))
@@ -196,6 +199,7 @@ def _table(lines: Lines) -> _Points:
 
 
 def _cells(lines: Lines, row: int, mark: str) -> list[str]:
+    """Split a row of a table into cells."""
     try:
         text = lines.text[row].decode("utf-8-sig")
         return [word.strip() for word in next(csv.reader([text], delimiter=mark, strict=True))]
@@ -204,6 +208,7 @@ def _cells(lines: Lines, row: int, mark: str) -> list[str]:
 
 
 def _point_of_row(lines: Lines, row: int, cells: dict[str, str], name: str, expected: str) -> tuple[str, np.ndarray]:
+    """Return name and point of a row; MeshFileError for a bad row."""
     point = _numbers([cells.get(axis) for axis in "xyz"])
     if point is None or not cells.get(name) or not np.isfinite(point).all():
         raise lines.fail(row, expected)
@@ -212,7 +217,7 @@ def _point_of_row(lines: Lines, row: int, cells: dict[str, str], name: str, expe
 
 def _rows_with_names(lines: Lines, count: int, expected: str, encoding: str, heading: bytes | None = None
                 ) -> list[tuple[str, Entry]]:
-    """Lines of so many numbers, the last three of them x, y, z, and a name; those with `heading` in them left out."""
+    """Read lines of `count` numbers, the last three x, y, z, and a name; lines with `heading` are skipped."""
     pairs: list[tuple[str, Entry]] = []
     for row, line in enumerate(lines.text):
         if heading is not None and heading in line:

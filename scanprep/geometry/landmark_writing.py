@@ -1,4 +1,4 @@
-"""Landmarks in the files of other programs; the counterpart of `landmark_reading`."""
+"""Write landmark files of other programs; the counterpart of `landmark_reading`."""
 from __future__ import annotations
 
 import csv
@@ -17,7 +17,7 @@ Format = Literal["json", "pp", "mrk.json", "fcsv", "scalismo.json", "csv", "lnd"
 
 
 def landmark_ending(format: Format) -> str:
-    """What the name of a landmark file ends with, so that `landmarks_beside` finds it; tables and text are many things.
+    """Return the ending of a landmark file by which `landmarks_beside` finds it.
 
     Examples
     --------
@@ -28,10 +28,10 @@ def landmark_ending(format: Format) -> str:
 
 
 def encode_landmarks(name: str, points: Points, unit: str | None) -> bytes | None:
-    """The contents of a file of this name with points (3,), metres; None for JSON of ours.
+    """Encode points (3,), metres, in the format of a file name; None for our JSON.
 
-    `unit` is that of the coordinates in the file; without one it is that which `read_landmarks` expects. ValueError for
-    a name of a landmark that the format cannot hold.
+    `unit` is that of the coordinates in the file, by default the one that `read_landmarks` expects. ValueError for a
+    landmark name that the format cannot hold.
     """
     ending = next((ending for ending in _WRITERS if name.lower().endswith(ending)), None)
     if ending is None:
@@ -40,14 +40,14 @@ def encode_landmarks(name: str, points: Points, unit: str | None) -> bytes | Non
 
 
 def _meshlab(points: Points, unit: str | None) -> str:
-    """MeshLab's PickPoints."""
+    """Encode MeshLab's PickPoints."""
     rows = "".join(f' <point x="{x:.12g}" y="{y:.12g}" z="{z:.12g}" active="1" name={quoteattr(name)}/>\n'
                    for name, (x, y, z) in _in_unit(points, unit or "m"))
     return f"<!DOCTYPE PickedPoints>\n<PickedPoints>\n{rows}</PickedPoints>\n"
 
 
 def _slicer(points: Points, unit: str | None) -> str:
-    """A markups file of 3D Slicer, in its LPS frame."""
+    """Encode a markups file of 3D Slicer, in its LPS frame."""
     controls = [{"id": str(i + 1), "label": name, "position": point.tolist(), "positionStatus": "defined"}
                 for i, (name, point) in enumerate(_in_unit(points, unit or "mm"))]
     return json.dumps({"markups": [{"type": "Fiducial", "coordinateSystem": "LPS", "coordinateUnits": unit or "mm",
@@ -55,7 +55,7 @@ def _slicer(points: Points, unit: str | None) -> str:
 
 
 def _fiducials(points: Points, unit: str | None) -> str:
-    """An .fcsv file of 3D Slicer, in its LPS frame."""
+    """Encode an .fcsv file of 3D Slicer, in its LPS frame."""
     columns = "id,x,y,z,ow,ox,oy,oz,vis,sel,lock,label,desc,associatedNodeID"
     rows = [(i + 1, *point, 0, 0, 0, 1, 1, 1, 0, name, "", "")
             for i, (name, point) in enumerate(_as_text(points, unit or "mm"))]
@@ -63,21 +63,23 @@ def _fiducials(points: Points, unit: str | None) -> str:
 
 
 def _scalismo(points: Points, unit: str | None) -> str:
+    """Encode JSON of scalismo."""
     return json.dumps([{"id": name, "coordinates": point.tolist()} for name, point in _in_unit(points, unit or "m")],
                       indent=1)
 
 
 def _table(points: Points, unit: str | None) -> str:
+    """Encode a CSV table."""
     return _csv([("name", "x", "y", "z"), *((name, *point) for name, point in _as_text(points, unit or "m"))])
 
 
 def _marker_set(points: Points, unit: str | None) -> str:
-    """A marker set of OpenSim 4, all in the frame of the ground."""
+    """Encode a marker set of OpenSim 4, all in the frame of the ground."""
     return marker_set({name: ("/ground", point) for name, point in _in_unit(points, unit or "m")})
 
 
 def marker_set(markers: Mapping[str, tuple[str, np.ndarray]]) -> str:
-    """A marker set of OpenSim 4: name -> the path of the frame, as `/bodyset/pelvis`, and the place in it, metres."""
+    """Encode a marker set of OpenSim 4: name -> path of the frame, as `/bodyset/pelvis`, and position (3,), metres."""
     rows = "".join(
         f"   <Marker name={quoteattr(name)}>\n    <socket_parent_frame>{escape(frame)}</socket_parent_frame>\n"
         f"    <location>{' '.join(map(repr, map(float, place)))}</location>\n    <fixed>false</fixed>\n   </Marker>\n"
@@ -88,13 +90,14 @@ def marker_set(markers: Mapping[str, tuple[str, np.ndarray]]) -> str:
 
 
 def _csv(rows: Iterable[Sequence[object]]) -> str:
+    """Encode rows as CSV."""
     out = io.StringIO()
     csv.writer(out, lineterminator="\n").writerows(rows)
     return out.getvalue()
 
 
 def _as_text(points: Points, unit: str) -> list[tuple[str, list[str]]]:
-    """Names as cells of a table may have them, and coordinates without loss."""
+    """Return names that fit into a table, and coordinates without loss; ValueError for other names."""
     wrong = next((name for name in points if name.splitlines() != [name] or name.strip() != name or "#" in name), None)
     if wrong is not None:
         raise ValueError(f"landmarks: '{wrong}' cannot be the name of a landmark in a file of lines; write JSON")
@@ -102,23 +105,25 @@ def _as_text(points: Points, unit: str) -> list[tuple[str, list[str]]]:
 
 
 def _caesar(points: Points, unit: str | None) -> str:
-    """CAESAR's .lnd: number, two codes, distance from the axis, x, y, z, name."""
+    """Encode CAESAR's .lnd: number, two codes, distance from the axis, x, y, z, name."""
     rows = [f"{i + 1} 0 0 {np.hypot(x, y):.6f} {x:.6f} {y:.6f} {z:.6f} {_one_line(name)}"
             for i, (name, (x, y, z)) in enumerate(_in_unit(points, unit or "mm"))]
     return "AUX =\n" + "\n".join(rows) + "\nEND =\n"
 
 
 def _rows(points: Points, unit: str | None) -> str:
-    """Lines of x, y, z and name."""
+    """Encode lines of x, y, z and name."""
     return "".join(f"{x:.12g} {y:.12g} {z:.12g} {_one_line(name)}\n"
                    for name, (x, y, z) in _in_unit(points, unit or "m"))
 
 
 def _in_unit(points: Points, unit: str) -> list[tuple[str, np.ndarray]]:
+    """Convert points from metres to a unit."""
     return [(name, np.asarray(point, dtype=float) / UNITS[unit]) for name, point in points.items()]
 
 
 def _one_line(name: str) -> str:
+    """Check that a name fits into a line; ValueError if not."""
     if name != " ".join(name.split()) or "=" in name or name.startswith("#"):
         raise ValueError(f"landmarks: '{name}' cannot be the name of a landmark in a file of lines; write JSON")
     return name

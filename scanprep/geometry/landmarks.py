@@ -1,4 +1,4 @@
-"""Files of landmarks: what they mean on a mesh, and which belongs to what; `landmark_reading` has the formats."""
+"""Read, write and match landmarks of meshes and scans; the file formats are in `landmark_reading`."""
 from __future__ import annotations
 
 import warnings
@@ -31,28 +31,36 @@ def read_landmarks(path: str | Path, mesh: Mesh | np.ndarray | None = None, unit
     ----------
     path : str or Path
         JSON `{name: [x, y, z]}`, `{name: vertex}` or `{name: {"face": f, "bary": [a, b, c]}}`, or of scalismo
-        (`[{"id": name, "coordinates": [x, y, z]}]`); MeshLab `.pp`; CAESAR `.lnd`; 3D Slicer `.mrk.json` and `.fcsv`;
-        `.csv` with a heading `name,x,y,z`; a marker set of OpenSim, `.xml`, whose markers are all in one frame;
-        otherwise text with lines `x y z name`.
+        (`[{"id": name, "coordinates": [x, y, z]}]`). MeshLab `.pp`. CAESAR `.lnd`. 3D Slicer `.mrk.json` and `.fcsv`.
+        `.csv` with a heading `name,x,y,z`. An OpenSim marker set, `.xml`, with all markers in one frame. Otherwise
+        text with lines `x y z name`.
     mesh : Mesh or (n, 3) float, metres, optional
-        The scan: what vertices and faces refer to, and on which the points must lie.
+        The scan that vertices and faces refer to, and on which the points must lie.
     unit : 'm', 'mm', 'cm' or 'in', optional
-        Unit of the coordinates in the file. When it is not given: millimetres for `.lnd` and `.fcsv`, what the file
-        says for `.mrk.json`, otherwise metres. Where they then do not lie on the scan and in another unit they do,
-        that unit is taken, with a UserWarning.
+        Unit of the coordinates in the file. By default millimetres for `.lnd` and `.fcsv`, the file's own for
+        `.mrk.json`, otherwise metres. If the points then do not lie on the scan, but do in another unit, that unit is
+        used, with a UserWarning.
 
     Returns
     -------
-    dict of name to (3,) float, metres
-        In the order of the file. Points of 3D Slicer are in its LPS frame, the one in which it reads and writes
-        meshes, unless the mesh at hand shows that they were meant in RAS.
+    dict of str to (3,) float, metres
+        In the order of the file. Points of 3D Slicer are in its LPS frame, in which it reads and writes meshes, unless
+        the mesh shows that they are in RAS.
 
     Raises
     ------
     MeshFileError
-        Missing or damaged, a value that is no point, a name that comes twice, a vertex or face out of range.
+        A missing or damaged file, a value that is no point, a repeated name, a vertex or face out of range.
     ValueError
-        A file that refers to vertices or faces, and no mesh.
+        A file that refers to vertices or faces, without a mesh.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> path = Path(tempfile.mkdtemp()) / "scan.json"
+    >>> write_landmarks(path, {"navel": np.array([0.0, 0.1, 1.0])})
+    >>> read_landmarks(path)["navel"].tolist()
+    [0.0, 0.1, 1.0]
     """
     path = Path(path)
     return {name: _place(path, name, value, mesh) for name, value in _entries(path, mesh, unit).items()}
@@ -61,15 +69,32 @@ def read_landmarks(path: str | Path, mesh: Mesh | np.ndarray | None = None, unit
 def read_landmark_vertices(path: str | Path, mesh: Mesh, unit: str | None = None) -> dict[str, int]:
     """Read named vertices of a mesh from any file of `read_landmarks`.
 
+    Parameters
+    ----------
+    path : str or Path
+        Landmark file.
+    mesh : Mesh
+        The mesh that it belongs to.
+    unit : 'm', 'mm', 'cm' or 'in', optional
+        Unit of the coordinates in the file, as for `read_landmarks`.
+
     Returns
     -------
-    dict of name to int
-        Where the file has coordinates the nearest vertex, where it has a point of a face the nearest corner.
+    dict of str to int
+        For coordinates the nearest vertex, for a point of a face the nearest corner.
 
     Raises
     ------
     MeshFileError
         As `read_landmarks`, and for coordinates that are not on the mesh: see `check_on_surface`.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> path = Path(tempfile.mkdtemp()) / "mesh.json"
+    >>> write_landmarks(path, {"tip": 1})
+    >>> read_landmark_vertices(path, Mesh([[0, 0, 0], [1, 0, 0], [0, 1, 0]], [[0, 1, 2]]))
+    {'tip': 1}
     """
     path = Path(path)
     entries = _entries(path, mesh, unit)
@@ -90,9 +115,9 @@ def read_landmark_vertices(path: str | Path, mesh: Mesh, unit: str | None = None
 
 
 def landmarks_beside(path: str | Path, folder: Path | None = None) -> Path | None:
-    """The landmark file of a scan or template: that of its name (`name_of`), beside it or in a folder.
+    """Find the landmark file of a scan or template by its name (`name_of`), beside it or in a folder; None without one.
 
-    A template called `template` has `landmarks.json` too, as in a registered set.
+    For a mesh called `template`, `landmarks.json` counts too, as in a registered set.
     """
     folder, stem = folder or Path(path).parent, name_of(path)
     names = [stem + ending for ending in LANDMARK_ENDINGS] + ["landmarks.json"] * (stem == "template")
@@ -101,7 +126,7 @@ def landmarks_beside(path: str | Path, folder: Path | None = None) -> Path | Non
 
 def read_template_landmarks(template: Path, mesh: Mesh, given: Path | None = None, flag: str = "--template-landmarks"
                             ) -> dict[str, int]:
-    """Named vertices of a template from the file given, or from the one beside it."""
+    """Read named vertices of a template from a given file, or from the one beside it."""
     path = given or landmarks_beside(template)
     if path is None:
         raise ValueError(f"{template}: expected its landmarks in {name_of(template)}.landmarks.json beside "
@@ -110,10 +135,9 @@ def read_template_landmarks(template: Path, mesh: Mesh, given: Path | None = Non
 
 
 def check_on_surface(path: str | Path, landmarks: Mapping[str, np.ndarray], surface: np.ndarray) -> None:
-    """Refuse points that cannot have been picked on a surface (n, 3): in another unit, or of something else.
+    """Raise MeshFileError for landmarks that cannot be on a surface (n, 3): another unit, or another object.
 
-    A landmark half the size of the surface away from it, or several so near to each other that they are all on
-    one spot of it.
+    A landmark is half the size of the surface away from it, or all landmarks lie within a hundredth of its size.
     """
     points, size = np.array(list(landmarks.values())).reshape(-1, 3), np.linalg.norm(np.ptp(surface, axis=0))
     far = cKDTree(surface).query(points)[0]
@@ -126,22 +150,30 @@ def check_on_surface(path: str | Path, landmarks: Mapping[str, np.ndarray], surf
 
 def write_landmarks(path: str | Path, landmarks: Mapping[str, np.ndarray | int | Mapping[str, Any]],
                     unit: str | None = None) -> None:
-    """Write named points, whole or not at all.
+    """Write named points, atomically.
 
     Parameters
     ----------
     path : str or Path
-        The ending tells the format, as for `read_landmarks`; an unknown one is JSON.
-    landmarks : name to (3,) float, metres, or vertex, or {"face": f, "bary": [a, b, c]}
-        The last two in JSON only.
+        The ending determines the format, as for `read_landmarks`; an unknown ending means JSON.
+    landmarks : dict of str to (3,) float, metres, or int, or {"face": f, "bary": [a, b, c]}
+        Points, vertices, or points of faces; the last two in JSON only.
     unit : 'm', 'mm', 'cm' or 'in', optional
-        Unit of the coordinates in the file, as it will be given to `read_landmarks`; which expects metres without it,
-        in `.lnd`, `.fcsv` and `.mrk.json` millimetres.
+        Unit of the coordinates in the file, to be given to `read_landmarks` again. By default metres; in `.lnd`,
+        `.fcsv` and `.mrk.json` millimetres.
 
     Raises
     ------
     ValueError
         A point that is not finite, or that the format cannot hold.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> path = Path(tempfile.mkdtemp()) / "scan.landmarks.json"
+    >>> write_landmarks(path, {"navel": np.array([0.0, 0.1, 1.0]), "left toe": 17})
+    >>> path.exists()
+    True
     """
     out: dict[str, Any] = {}
     for name, value in landmarks.items():
@@ -165,36 +197,52 @@ def write_landmarks(path: str | Path, landmarks: Mapping[str, np.ndarray | int |
 
 def match_landmarks(template_landmarks: Mapping[str, Any], scan_landmarks: Mapping[str, Any], minimum: int = 3
                     ) -> tuple[tuple[str, ...], np.ndarray, np.ndarray]:
-    """The landmarks that the template and the scan have in common, in the template's order.
+    """Find the landmarks that template and scan share, in the template's order.
 
-    Names that mean the same count as the same: `crown` and `top of head`, `LeftHand` and `left middle finger`.
+    Synonyms match: `crown` and `top of head`, `LeftHand` and `left middle finger`.
+
+    Parameters
+    ----------
+    template_landmarks : dict of str to value
+        Landmarks of the template, usually vertices.
+    scan_landmarks : dict of str to value
+        Landmarks of the scan, usually points (3,), metres.
+    minimum : int
+        Least number of matches.
 
     Returns
     -------
-    names : L strings
-        The template's.
-    template values : (L, ...) array
-    scan values : (L, ...) array
+    names : tuple of L str
+        The template's names.
+    template_values : (L, ...) array
+        Values of the template's landmarks.
+    scan_values : (L, ...) array
+        Values of the scan's landmarks.
 
     Raises
     ------
     ValueError
-        Fewer than `minimum` names match; both lists are in the message.
+        Fewer than `minimum` names match; the message lists both.
+
+    Examples
+    --------
+    >>> match_landmarks({"top of head": 4, "navel": 7}, {"crown": 1, "navel": 2, "chin": 3}, minimum=2)[0]
+    ('top of head', 'navel')
     """
     pairs = pair_names(template_landmarks, scan_landmarks)
     if len(pairs) < minimum:
         raise ValueError(f"landmarks: expected at least {minimum} names that template and scan share, found "
                          f"{len(pairs)}; template: {', '.join(template_landmarks) or 'none'}; "
                          f"scan: {', '.join(scan_landmarks) or 'none'}")
-    return (tuple(ours for ours, _ in pairs), np.array([template_landmarks[ours] for ours, _ in pairs]),
-            np.array([scan_landmarks[theirs] for _, theirs in pairs]))
+    return (tuple(name for name, _ in pairs), np.array([template_landmarks[name] for name, _ in pairs]),
+            np.array([scan_landmarks[name] for _, name in pairs]))
 
 
 def try_match_landmarks(path: Path, template_landmarks: Mapping[str, int], scan_landmarks: Mapping[str, np.ndarray]
                         ) -> tuple[np.ndarray, np.ndarray] | None:
-    """Vertices (L,) and points (L, 3) that `match_landmarks` pairs; None, with a warning, where they are too few.
+    """Match landmarks: vertices (L,) and points (L, 3); None, with a warning, if too few match.
 
-    `path` is the scan's landmark file, for the warning, which says what both sides call theirs.
+    `path` is the scan's landmark file, for the warning, which lists the names of both sides.
     """
     try:
         return match_landmarks(template_landmarks, scan_landmarks)[1:]
@@ -204,6 +252,7 @@ def try_match_landmarks(path: Path, template_landmarks: Mapping[str, int], scan_
 
 
 def _entries(path: Path, mesh: Mesh | np.ndarray | None, unit: str | None) -> dict[str, Entry]:
+    """Read and check the entries of a file, with points in metres."""
     pairs, own_unit, flipped = entries_of(path, load_bytes(path), unit)
     if not pairs:
         raise MeshFileError(f"{path}: expected landmarks, found none")
@@ -227,47 +276,48 @@ def _entries(path: Path, mesh: Mesh | np.ndarray | None, unit: str | None) -> di
 
 def _metres_on_surface(path: Path, points: np.ndarray, scan: Mesh | np.ndarray, unit: str | None, flipped: bool
                        ) -> np.ndarray:
-    """What to multiply the points (L, 3) of a file with (3,), so that they lie on a scan, a mesh or points (n, 3).
+    """Find the factors (3,) by which points (L, 3) of a file lie on a scan, a mesh or points (n, 3).
 
-    Programs write units that are not those of the scan: 3D Slicer calls everything millimetres. So the unit told
-    counts where the points then lie on the scan, else the one in which they do. A body looks much alike from in front
-    and from behind, so axes that the file tells are doubted only where the others fit far better.
+    Programs write units that differ from the scan's: 3D Slicer calls everything millimetres. So the stated unit counts
+    if the points then lie on the scan, else the unit in which they do. Front and back of a body look alike, so the
+    stated axes are changed only if the others fit far better.
     """
-    told, of_scan = metres_of(unit), scan.vertices if isinstance(scan, Mesh) else scan
+    stated, of_scan = metres_of(unit), scan.vertices if isinstance(scan, Mesh) else scan
     size = float(np.linalg.norm(np.ptp(of_scan, axis=0)))
     surface = Surface(scan) if isinstance(scan, Mesh) and len(scan.faces) else cKDTree(of_scan)
     signs = [np.ones(3), np.array([-1.0, -1, 1])] if flipped else [np.ones(3)]
 
     def away(scale: np.ndarray) -> float:
+        """Return the median distance from the scan."""
         places = points * scale
         return float(np.median(surface.closest(places).distances if isinstance(surface, Surface)
                                else surface.query(places)[0]))
 
     def misfit(scale: np.ndarray) -> float:
-        # times as near the points must lie in other axes than those that the file tells
+        """Return the distance, doubled for other axes than stated: they must fit twice as well."""
         return away(scale) * (1.0 if scale[0] > 0 else 2.0)
 
     def fits(scale: np.ndarray) -> bool:
-        spread = float(np.linalg.norm(np.ptp(points * scale, axis=0)))      # on one spot of it anything lies on it
-        # of its size: clicks lie so near to a scan, those in another unit do not
-        # of its size: landmarks of a person, who has hands, feet and a head, spread wider
+        """Test whether the points lie on the scan: within 3% of its size, as clicks do, and spread over 20% of it."""
+        spread = float(np.linalg.norm(np.ptp(points * scale, axis=0)))      # a single spot would always fit
         return spread > 0.2 * size and away(scale) <= 0.03 * size
 
-    best = min((told * sign for sign in signs), key=misfit)
+    best = min((stated * sign for sign in signs), key=misfit)
     if len(points) < 3 or fits(best):
         return best
-    # every ratio of two units, as the scan may have been converted and the landmarks not, or the other way round
+    # try every ratio of two units: either the scan or the landmarks may have been converted
     factors = {a / b for a in UNITS.values() for b in UNITS.values()}
-    others = [scale for factor in factors for sign in signs if fits(scale := told * factor * sign)]
+    others = [scale for factor in factors for sign in signs if fits(scale := stated * factor * sign)]
     if not others:
         return best
     other = min(others, key=misfit)
     warnings.warn(f"{path}: read in {unit or 'm'} the landmarks do not lie on the scan; multiplied by "
-                  f"{abs(other[0]) / told:.4g} they do, and so they are used", stacklevel=4)
+                  f"{abs(other[0]) / stated:.4g} they do, and so they are used", stacklevel=4)
     return other
 
 
 def _place(path: Path, name: str, value: Entry, mesh: Mesh | np.ndarray | None) -> np.ndarray:
+    """Return the position (3,), metres, of one landmark."""
     if isinstance(value, np.ndarray):
         return value
     if not isinstance(mesh, Mesh):
@@ -280,7 +330,7 @@ def _place(path: Path, name: str, value: Entry, mesh: Mesh | np.ndarray | None) 
 
 
 def _vertex(path: Path, name: str, number: int, mesh: Mesh) -> int:
-    """The vertex of a mesh that a file calls by this number, which is that in the file of the mesh."""
+    """Return the vertex of a mesh for a vertex number of its file."""
     _check_number(path, name, "vertex", number, len(mesh.vertices if mesh.of_file is None else mesh.of_file))
     if mesh.of_file is None:
         return number
@@ -290,5 +340,6 @@ def _vertex(path: Path, name: str, number: int, mesh: Mesh) -> int:
 
 
 def _check_number(path: Path, name: str, what: str, number: int, count: int) -> None:
+    """Raise MeshFileError for a vertex or face that does not exist."""
     if not 0 <= number < count:
         raise MeshFileError(f"{path}: landmark '{name}' refers to {what} {number}, the mesh has 0..{count - 1}")

@@ -1,10 +1,10 @@
-"""Levenberg-Marquardt: the one loop of least squares, for a batch of problems at once, with rotations as unknowns.
+"""Levenberg-Marquardt for batches of least-squares problems, with rotations as unknowns.
 
-The caller gives the normal equations at a state; their structure solves for the step:
+The caller gives the normal equations at a state; their structure determines how a step is solved:
 
 - `Dense`: B independent problems with P unknowns each, every one with its own damping;
-- `Deferred`: one such problem whose matrix is assembled where a step is taken, not where one is only tried;
-- `Arrow`: many frames with unknowns of their own, coupled by those they share alone;
+- `Deferred`: one such problem whose matrix is assembled only for accepted steps, not for tried ones;
+- `Arrow`: many frames with unknowns of their own, coupled only by shared unknowns;
 - `Sparse`: one large problem with a sparse matrix.
 
 A step is added to the state, unless a `retract` says otherwise, as for rotations.
@@ -22,7 +22,7 @@ from scipy.sparse import csc_array
 from . import rotations, sparse
 
 State = TypeVar("State")
-FLOOR = 1e-9                         # of the largest diagonal entry, added to all: some unknowns may have no data
+FLOOR = 1e-9                         # share of the largest diagonal entry added to all: unknowns may have no data
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,18 +34,18 @@ class Residual:
 
     @property
     def energy(self) -> np.ndarray:
-        """(...) the sum of squares."""
+        """(...) sum of squares."""
         return np.einsum("...m,...m->...", self.values, self.values)
 
 
 class NormalEquations(Protocol):
-    """An energy near one state: its value (B,), and the step that lowers it."""
+    """The quadratic model of an energy at one state: its value (B,), and the step that lowers it."""
 
     @property
     def energy(self) -> np.ndarray: ...
 
     def step(self, damping: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """The step at a damping (B,), and by how much it lowers the quadratic model of the energy (B,)."""
+        """Solve for the step at a damping (B,); return it with the decrease (B,) of the quadratic model."""
         ...
 
 
@@ -57,6 +57,7 @@ class Dense(NamedTuple):
     hessian: np.ndarray
 
     def step(self, damping: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        # (H + damping diag(H) + floor) step = -g
         diagonal = np.diagonal(self.hessian, axis1=1, axis2=2)
         ridge = damping[:, None] * diagonal + FLOOR * diagonal.max(axis=1, keepdims=True)
         step = -np.linalg.solve(self.hessian + ridge[:, :, None] * np.eye(ridge.shape[1]),
@@ -66,14 +67,14 @@ class Dense(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Deferred:
-    """One dense problem, a batch of its own: its energy (1,), and its equations when a step is wanted."""
+    """One dense problem, a batch of one: its energy (1,), and its equations when a step is solved."""
 
     energy: np.ndarray
     assemble: Callable[[], Dense]
 
     @cached_property
     def dense(self) -> Dense:
-        """The equations."""
+        """The equations, assembled once."""
         return self.assemble()
 
     def step(self, damping: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -95,7 +96,7 @@ class Arrow(NamedTuple):
         return self.rows.energy.sum(keepdims=True) + (0.0 if self.common is None else self.common.energy)
 
     def step(self, damping: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Frames are eliminated from the damped equations, what they share is solved for."""
+        """Eliminate the frames from the damped equations (Schur complement), and solve for the shared unknowns."""
         _, gradient, hessian = self.rows
         n = gradient.shape[1] - self.shared
         slope, shared = gradient[:, n:].sum(axis=0), hessian[:, n:, n:].sum(axis=0)
@@ -105,6 +106,7 @@ class Arrow(NamedTuple):
         diagonal = np.diagonal(own, axis1=1, axis2=2)
         floor = FLOOR * max(diagonal.max(), np.diag(shared).max(initial=0.0))
         ridge, ridge_shared = damping[0] * diagonal + floor, damping[0] * np.diag(shared) + floor
+        # solve every frame for its gradient and its coupling; then the reduced system; then back-substitute
         solved = np.linalg.solve(own + ridge[:, :, None] * np.eye(n),
                                  np.concatenate([cross, gradient[:, :n, None]], axis=2))
         back = np.swapaxes(cross, 1, 2) @ solved                                       # (B, S, S + 1)
@@ -117,9 +119,9 @@ class Arrow(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Sparse:
-    """One problem with a sparse matrix (P, P); it and half the gradient (P,) are assembled when a step is wanted.
+    """One problem with a sparse matrix (P, P); it and half the gradient (P,) are assembled when a step is solved.
 
-    Which `terms` the energy is the sum of can be told.
+    `terms` may list the parts of the energy.
     """
 
     value: float
@@ -145,7 +147,7 @@ class Sparse:
 
 
 def normal_equations(residuals: Sequence[Residual]) -> Dense:
-    """The equations of a sum of residuals with a leading dimension B."""
+    """Assemble the Gauss-Newton equations of a sum of residuals with a leading dimension B."""
     first = residuals[0].jacobian
     cost = np.zeros(len(first))
     gradient = np.zeros((len(first), first.shape[-1]))
@@ -159,9 +161,9 @@ def normal_equations(residuals: Sequence[Residual]) -> Dense:
 
 
 def retract_pose(angles: int) -> Callable[[np.ndarray, np.ndarray], np.ndarray]:
-    """A retract of rows (..., P) whose first unknowns are rotation vectors: `R exp(d)`, the rest by addition.
+    """Return a retraction of rows (..., P) whose first unknowns are rotation vectors: `R exp(d)`; the rest is added.
 
-    For equations whose derivatives are by `d` at zero. Rotation vectors come out at most π long.
+    For equations with derivatives with respect to `d` at zero. Resulting rotation vectors are at most π long.
     """
     def retract(x: np.ndarray, step: np.ndarray) -> np.ndarray:
         out = x + step
@@ -173,18 +175,18 @@ def retract_pose(angles: int) -> Callable[[np.ndarray, np.ndarray], np.ndarray]:
 
 
 def step_between(x: np.ndarray, goal: np.ndarray, angles: int) -> np.ndarray:
-    """The step (..., P) by which the retract of `retract_pose(angles)` leads from rows x to others."""
+    """Return the step (..., P) by which the retraction `retract_pose(angles)` leads from rows x to others."""
     return retract_pose(angles)(-x, goal)
 
 
 def by_rotations(equations: Any, x: Any, angles: int) -> Any:
-    """`Dense` or `Arrow` equations at rows x (B, P) that begin with rotation vectors, by small rotations `R exp(d)`."""
+    """Convert `Dense` or `Arrow` equations at rows x (B, P) from rotation vectors to small rotations `R exp(d)`."""
     if isinstance(equations, Arrow):
         return equations._replace(rows=by_rotations(equations.rows, x, angles))
     local = np.swapaxes(rotations.inverse_right_jacobian(x[:, :angles].reshape(len(x), -1, 3)), -1, -2)
 
     def along(matrix: np.ndarray) -> np.ndarray:
-        """The rows (B, P, k) of the vectors by the rotations."""
+        """Convert rows (B, P, k) by the chain rule."""
         out = matrix.copy()
         own = out[:, :angles]
         own[:] = (local @ own.reshape(*local.shape[:3], -1)).reshape(own.shape)
@@ -196,7 +198,7 @@ def by_rotations(equations: Any, x: Any, angles: int) -> Any:
 
 @dataclass(frozen=True, eq=False)
 class Minimum(Generic[State]):
-    """Where the search ended: the state, its equations, which of the B problems converged, and the steps tried."""
+    """The result: the state, its equations, which of the B problems converged, and the number of steps tried."""
 
     x: State
     equations: Any
@@ -205,20 +207,19 @@ class Minimum(Generic[State]):
 
     @property
     def energy(self) -> np.ndarray:
-        """(B,)"""
+        """(B,) energy at the minimum."""
         return np.asarray(self.equations.energy)
 
 
 def levenberg_marquardt(equations: Callable[[State], NormalEquations], start: State, iterations: int = 30,
                         tolerance: float = 1e-5, damping: float = 1e-3, exact: float = 0.0,
                         retract: Callable[[Any, np.ndarray], Any] = np.add, angles: int = 0) -> Minimum[State]:
-    """The state of least energy near a start; a step is taken only where it lowers the energy.
+    """Minimise an energy from a start by Levenberg-Marquardt; a step is accepted only if it lowers the energy.
 
-    A state is (B, P) float for `Dense` and `Arrow`, for `Sparse` whatever `retract`, which does a step to it, takes.
-    The search stops after so many `iterations`, steps tried, or when a step lowers the energy by less than the fraction
-    `tolerance`, or by less than `exact`. `damping` is the first factor on the diagonal of the matrix. With `angles` so
-    many first unknowns of a row are rotation vectors: derivatives are by them, steps are small rotations, and so are
-    the equations that are returned.
+    A state is (B, P) float for `Dense` and `Arrow`, and anything that `retract` accepts for `Sparse`. The search stops
+    after `iterations` tried steps, or when a step lowers the energy by less than the fraction `tolerance`, or by less
+    than `exact`. `damping` is the initial factor on the diagonal of the matrix. The first `angles` unknowns of a row
+    are rotation vectors: derivatives are with respect to them, but steps and returned equations are in small rotations.
     """
     if angles:
         retract, by_vectors = retract_pose(angles), equations
@@ -237,21 +238,22 @@ def levenberg_marquardt(equations: Callable[[State], NormalEquations], start: St
         tried = equations(ahead)
         better = (tried.energy < now.energy) & ~converged
         least = np.maximum(tolerance * now.energy, max(exact, 1e-300))
-        # a step that failed settles nothing unless there was nothing to gain: it may have been too long
+        # a failed step proves convergence only if nothing was to be gained: it may just have been too long
         settled = (better & (now.energy - tried.energy <= least)) | (gain <= least)
-        converged |= settled | (factor > 1e8)        # so much damping: no step lowers the energy any more
+        converged |= settled | (factor > 1e8)        # with so much damping no step lowers the energy
         x, now = _take(better, x, ahead), _take(better, now, tried)
+        # damping: divided by 5 after a success, times 8 after a failure
         factor = np.where(better, np.maximum(factor / 5, 1e-9), factor * 8)
     return Minimum(x, now, converged, done)
 
 
 def _gain(gradient: np.ndarray, step: np.ndarray, ridge: np.ndarray) -> np.ndarray:
-    """By how much a step s of (H + ridge) s = -g lowers the energy if it were quadratic: sᵀ ridge s - g·s."""
+    """Compute the decrease of the quadratic model by a step s of (H + ridge) s = -g: sᵀ ridge s - g·s."""
     return np.einsum("...p,...p->...", ridge * step - gradient, step)
 
 
 def _take(better: np.ndarray, old: Any, new: Any) -> Any:
-    """The new rows where they are better; a single problem is taken or left whole."""
+    """Take the new rows where they are better; a single problem is taken or left whole."""
     if better.all():
         return new
     if not better.any():

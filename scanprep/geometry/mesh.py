@@ -1,4 +1,4 @@
-"""The triangle mesh that every stage passes on."""
+"""The triangle mesh that all stages use."""
 from __future__ import annotations
 
 from dataclasses import dataclass
@@ -14,25 +14,32 @@ from .sparse import label_components, unique_integers
 
 @dataclass(frozen=True, eq=False)
 class Mesh:
-    """Vertices and the triangles between them.
+    """A triangle mesh.
 
-    Derived quantities are computed on first use and kept, so neither array may be written to afterwards;
-    both are set read-only.
+    Derived quantities are computed on first use and cached. So all arrays are copied and read-only.
 
     Parameters
     ----------
     vertices : (N, 3) float, metres
+        Positions.
     faces : (F, 3) int
-        Counter-clockwise seen from outside.
+        Vertices of the triangles, counter-clockwise seen from outside.
     colors : (N, 3) float in [0, 1], optional
+        Red, green and blue of every vertex.
     of_file : (M,) int, optional
-        Which vertex each one of the file has become, where its reader merged some; files of vertex numbers mean those
-        of the file.
+        The vertex here of each vertex of the file, if its reader merged some; -1 if it was left out. Files with vertex
+        numbers refer to those of the mesh file.
 
     Raises
     ------
     ValueError
         An array of the wrong shape, a vertex that is not finite, an index out of range.
+
+    Examples
+    --------
+    >>> triangle = Mesh([[0, 0, 0], [1, 0, 0], [0, 1, 0]], [[0, 1, 2]])
+    >>> triangle.face_areas.tolist(), triangle.edges.shape, triangle.is_closed
+    ([0.5], (3, 2), False)
     """
 
     vertices: np.ndarray
@@ -47,6 +54,7 @@ class Mesh:
             raise ValueError(f"vertices: expected shape (N, 3), got {vertices.shape}")
         if faces.ndim != 2 or faces.shape[1] != 3:
             raise ValueError(f"faces: expected shape (F, 3), got {faces.shape}")
+        # refuse values and indices that would fail later, with the first bad one
         bad = np.flatnonzero(~np.isfinite(vertices).all(axis=1))
         if len(bad):
             raise ValueError(f"vertices: {len(bad)} are not finite, the first is vertex {bad[0]}")
@@ -68,7 +76,7 @@ class Mesh:
         return f"Mesh({len(self.vertices)} vertices, {len(self.faces)} faces)"
 
     def with_vertices(self, vertices: np.ndarray) -> Mesh:
-        """The same triangles on other vertices (N, 3)."""
+        """Return a mesh with the same triangles and other vertices (N, 3), metres."""
         return Mesh(vertices, self.faces, self.colors, self.of_file)
 
     @cached_property
@@ -78,17 +86,18 @@ class Mesh:
 
     @cached_property
     def _cross(self) -> np.ndarray:
+        """(F, 3) cross products of two sides: twice the area vectors."""
         c = self.corners
         return np.cross(c[:, 1] - c[:, 0], c[:, 2] - c[:, 0])
 
     @cached_property
     def face_areas(self) -> np.ndarray:
-        """(F,) square metres."""
+        """(F,) areas of the triangles, square metres."""
         return 0.5 * np.linalg.norm(self._cross, axis=1)
 
     @cached_property
     def face_normals(self) -> np.ndarray:
-        """(F, 3) unit normals; zero for a triangle without area."""
+        """(F, 3) unit normals; zero for a degenerate triangle."""
         return _unit(self._cross)
 
     @cached_property
@@ -104,6 +113,7 @@ class Mesh:
 
     @cached_property
     def _edges_and_sides(self) -> tuple[np.ndarray, np.ndarray]:
+        """`edges` and `face_edges`, computed together."""
         a, b = self.faces, np.roll(self.faces, -1, axis=1)
         count = len(self.vertices)           # one number per edge sorts several times faster than rows
         key, of_half = np.unique(np.minimum(a, b) * count + np.maximum(a, b), return_inverse=True)
@@ -121,7 +131,7 @@ class Mesh:
 
     @cached_property
     def edge_lengths(self) -> np.ndarray:
-        """(E,) metres."""
+        """(E,) lengths of the edges, metres."""
         a, b = self.edges.T
         return np.linalg.norm(self.vertices[a] - self.vertices[b], axis=1)
 
@@ -144,7 +154,7 @@ class Mesh:
 
     @cached_property
     def vertex_adjacency(self) -> csr_array:
-        """(N, N) sparse, 1 where an edge joins two vertices."""
+        """(N, N) sparse adjacency, 1 where an edge joins two vertices."""
         a, b = self.edges.T
         n = len(self.vertices)
         one = np.ones(2 * len(a))
@@ -152,14 +162,14 @@ class Mesh:
 
     @cached_property
     def is_edge_manifold(self) -> bool:
-        """No edge has more than two triangles, and neighbours agree on which side is outside."""
+        """Whether no edge has more than two triangles, and neighbours have the same orientation."""
         half = self.faces * len(self.vertices) + np.roll(self.faces, -1, axis=1)
         in_order = np.sort(half, axis=None)
         return bool((self.edge_use <= 2).all()) and bool((in_order[1:] != in_order[:-1]).all())
 
     @cached_property
     def corner_fans(self) -> np.ndarray:
-        """(F, 3) number of the fan each corner belongs to; corners at a vertex share it when edges join them."""
+        """(F, 3) fan of each corner; corners at a vertex are in the same fan if their triangles are joined by edges."""
         corner = np.arange(self.faces.size).reshape(-1, 3)
         rows = []
         for side in range(3):        # corners of the two triangles at an inner edge that share a vertex
@@ -176,7 +186,7 @@ class Mesh:
 
     @cached_property
     def is_vertex_manifold(self) -> bool:
-        """The triangles around every vertex form one fan."""
+        """Whether the triangles around every vertex form one fan."""
         return int(self.corner_fans.max(initial=-1)) + 1 == len(unique_integers(self.faces))
 
     @cached_property
@@ -200,36 +210,36 @@ class Mesh:
 
     @cached_property
     def is_closed(self) -> bool:
-        """Every edge has exactly two triangles."""
+        """Whether every edge has exactly two triangles."""
         return bool(len(self.faces)) and bool((self.edge_use == 2).all())
 
     @cached_property
     def vertex_component(self) -> np.ndarray:
-        """(N,) number of the connected component of each vertex, largest 0; one without triangles is its own."""
+        """(N,) connected component of each vertex, largest 0; a vertex without triangles is its own component."""
         _, label = connected_components(self.vertex_adjacency, directed=False)
         rank = np.argsort(-np.bincount(label), kind="stable")
         return np.argsort(rank)[label]
 
     @cached_property
     def volume(self) -> float:
-        """Enclosed volume in cubic metres; meaningful when closed, negative when inside out."""
+        """Enclosed volume, cubic metres; meaningful for a closed mesh, negative if it is inside out."""
         c = self.corners
         return float(np.einsum("fi,fi->", c[:, 0], np.cross(c[:, 1], c[:, 2])) / 6)
 
     @cached_property
     def mean_edge(self) -> float:
-        """Mean edge length in metres, the resolution of the mesh."""
+        """Mean edge length, metres: the resolution of the mesh."""
         return float(self.edge_lengths.mean())
 
     def submesh(self, keep: np.ndarray) -> tuple[Mesh, np.ndarray]:
-        """The triangles `keep`, (F,) bool or (n,) int, and the vertices they use, with the old index (n,) of each."""
+        """Return triangles `keep`, (F,) bool or (n,) int, with the vertices they use, and their old indices (n,)."""
         faces = self.faces[keep]
         used, new = np.unique(faces, return_inverse=True)
         colors = None if self.colors is None else self.colors[used]
         return Mesh(self.vertices[used], new.reshape(-1, 3), colors), used
 
     def sample(self, count: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Points (count, 3) spread evenly over the surface, their triangles (count,) and barycentric coordinates."""
+        """Draw points (count, 3) evenly over the surface; with their triangles (count,) and barycentric coordinates."""
         face = rng.choice(len(self.faces), count, p=self.face_areas / self.face_areas.sum())
         r = np.sqrt(rng.random(count))
         s = rng.random(count)
@@ -238,9 +248,9 @@ class Mesh:
 
 
 def template_problem(mesh: Mesh) -> str | None:
-    """Why a mesh cannot serve as template, or None when it can.
+    """Explain why a mesh cannot serve as a template; None if it can.
 
-    It is one connected manifold component, without unused vertices, repeated triangles or triangles without area.
+    It must be one connected manifold component, without unused vertices, duplicate or degenerate triangles.
     """
     if not len(mesh.faces):
         return "it has no triangles"
@@ -264,13 +274,14 @@ def template_problem(mesh: Mesh) -> str | None:
 
 
 def check_template(mesh: Mesh, name: str = "template") -> None:
-    """Raise ValueError with the reason when a mesh cannot serve as template."""
+    """Raise ValueError with the reason if a mesh cannot serve as a template."""
     problem = template_problem(mesh)
     if problem:
         raise ValueError(f"{name}: not usable as a template, {problem}")
 
 
 def _unit(v: np.ndarray) -> np.ndarray:
+    """Normalise vectors (..., 3); zero stays zero."""
     length = np.linalg.norm(v, axis=-1, keepdims=True)
     return np.divide(v, length, out=np.zeros_like(v), where=length > 0)
 
@@ -287,10 +298,11 @@ def _loops(border: np.ndarray) -> list[np.ndarray]:
         while path:
             ahead = following.get(path[-1])
             if not ahead:
-                break                # an open end: only where the mesh is not manifold
+                break                # an open end: the mesh is not manifold there
             step = ahead.pop()
             if not ahead:
                 del following[path[-1]]
+            # a vertex was reached again: the path since then is a simple loop; go on with the rest
             if step in place:
                 first = place[step]
                 loops.append(np.array(path[first:]))

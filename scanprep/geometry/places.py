@@ -1,4 +1,4 @@
-"""Distinct places of points: how they repeat, and how far the distinct ones lie apart."""
+"""Distinct points: find repeated ones, and the spacing of distinct ones."""
 from __future__ import annotations
 
 import numpy as np
@@ -9,11 +9,11 @@ from .farthest_points import thin
 
 
 def distinct_rows(rows: np.ndarray) -> np.ndarray | None:
-    """The first row that each row (n, 3) is equal to, (n,) int; None where all rows are distinct."""
+    """Find for each row (n, 3) the first equal row (n,) int; None if all rows are distinct."""
     rows = np.ascontiguousarray(rows)
     if rows.dtype.kind == "f":
-        rows = rows + 0.0                    # minus zero is zero
-    # One number for each row sorts many times faster than the rows; rows that share one by chance are told apart.
+        rows = rows + 0.0                    # -0.0 becomes 0.0
+    # one hash per row sorts many times faster than rows; hash collisions are detected below
     bits = rows.view(np.uint64)
     key = np.zeros(len(rows), dtype=np.uint64)
     for column in bits.T:
@@ -28,24 +28,25 @@ def distinct_rows(rows: np.ndarray) -> np.ndarray | None:
 
 
 def distinct_places(points: np.ndarray) -> np.ndarray:
-    """Numbers of the points (n, 3) that repeat no earlier one, ascending."""
+    """Return the indices of points (n, 3) that repeat no earlier one, ascending."""
     of = distinct_rows(points)
     return np.arange(len(points)) if of is None else np.flatnonzero(of == np.arange(len(of)))
 
 
 def spacing(points: np.ndarray) -> float:
-    """Median distance, metres, to the nearest distinct place, over the whole surface evenly.
+    """Estimate the spacing of points: the median distance, metres, to the nearest distinct point.
 
-    Points that are repeated, or all but so where views overlap, are one place.
+    Repeated points, or nearly repeated ones where views overlap, count as one.
 
     Parameters
     ----------
     points : (n, 3) float, metres
+        Points of a surface.
 
     Returns
     -------
     float, metres
-        0 for fewer than two places.
+        0 for fewer than two distinct points.
 
     Examples
     --------
@@ -57,13 +58,13 @@ def spacing(points: np.ndarray) -> float:
     if len(points) < 2:
         return 0.0
     extent = float(np.ptp(points, axis=0).max())
-    # nine points in ten; a depth camera puts those that it did not see 65 m away, a cell for each
+    # extent of nine points in ten: depth cameras put missing points 65 m away, which would need a cell each
     inner = float(np.ptp(np.quantile(points, (0.05, 0.95), axis=0), axis=0).max())
-    extent = inner if 0 < inner < extent / 2 else extent                # a few points lie far off the rest
-    # along the longest side: one point of each cell is asked, so that no dense part rules
-    some = points[thin(points, extent / 80)]
-    # neighbours that tell how dense the points are
-    apart = cKDTree(points).query(some, min(9, len(points)), workers=search_threads(len(some)))[0][:, 1:]
-    # of the distance to the last of them, within which two points are one place
+    extent = inner if 0 < inner < extent / 2 else extent                # a few points are far away
+    # ask one point per cell, 80 along the longest side, so that dense parts do not dominate
+    sample = points[thin(points, extent / 80)]
+    # eight neighbours show the local density
+    apart = cKDTree(points).query(sample, min(9, len(points)), workers=search_threads(len(sample)))[0][:, 1:]
+    # points within a tenth of the eighth neighbour's distance are repeated
     other = apart > 0.1 * apart[:, -1:]
     return float(np.median(apart[np.arange(len(apart)), other.argmax(axis=1)]))

@@ -1,4 +1,4 @@
-"""Better triangles on the same surface: edges flipped, vertices moved along it."""
+"""Improve triangles on the same surface: flip edges, and move vertices along it."""
 from __future__ import annotations
 
 import numpy as np
@@ -10,10 +10,10 @@ from .surface import Surface
 
 
 def flip_edges(mesh: Mesh, allowed: np.ndarray | None = None, rounds: int = 20, min_cosine: float = 0.7) -> Mesh:
-    """Edges flipped until, as far as the surface allows, opposite angles sum to at most 180 degrees.
+    """Flip edges until opposite angles sum to at most 180 degrees (Delaunay), as far as the surface allows.
 
-    Only triangles `allowed` (F,) change, and triangles keep their rows. Edges whose triangles meet at a sharper angle
-    than `min_cosine` stay, and no flip makes a sharper one; -1 flips all.
+    Only triangles `allowed` (F,) change, and triangles keep their rows. Edges with a bend sharper than `min_cosine`
+    stay, and no flip creates a sharper one; -1 flips all.
     """
     faces = np.array(mesh.faces)
     allowed = np.ones(len(faces), dtype=bool) if allowed is None else allowed
@@ -24,7 +24,7 @@ def flip_edges(mesh: Mesh, allowed: np.ndarray | None = None, rounds: int = 20, 
 
 
 def _flip_once(v: np.ndarray, faces: np.ndarray, allowed: np.ndarray, min_cosine: float) -> int:
-    """One round of flips that do not touch each other; changes `faces` and returns their number."""
+    """Flip a set of independent edges; change `faces` in place and return the number of flips."""
     count = len(v)
     start, end = faces.ravel(), np.roll(faces, -1, axis=1).ravel()
     across = np.roll(faces, 1, axis=1).ravel()
@@ -33,6 +33,7 @@ def _flip_once(v: np.ndarray, faces: np.ndarray, allowed: np.ndarray, min_cosine
     known = unique_integers(key)
     order = np.argsort(key, kind="stable")
     order = order[allowed[face[order]]]
+    # pairs of half-edges at an inner edge, and how far their opposite angles exceed 180 degrees
     twin = np.flatnonzero(key[order][1:] == key[order][:-1])
     h, g = order[twin], order[twin + 1]
     a, b, c, d = start[h], end[h], across[h], across[g]          # triangles a b c and b a d
@@ -41,6 +42,7 @@ def _flip_once(v: np.ndarray, faces: np.ndarray, allowed: np.ndarray, min_cosine
     place = np.minimum(np.searchsorted(known, ends), len(known) - 1)
     good = (gain > 1e-3) & (c != d) & (known[place] != ends) & (start[g] == b)
     h, g, a, b, c, d, gain, ends = (x[good] for x in (h, g, a, b, c, d, gain, ends))
+    # neither the old nor the new pair may bend sharply, and no triangle may invert
     old = _normal(v, a, b, c), _normal(v, b, a, d)
     new = _normal(v, a, d, c), _normal(v, d, b, c)
     mean = old[0] + old[1]
@@ -49,6 +51,7 @@ def _flip_once(v: np.ndarray, faces: np.ndarray, allowed: np.ndarray, min_cosine
         good = (_dot(*old) > min_cosine) & (_dot(*new) > min_cosine) & (_dot(new[0], mean) > 0)
         good &= _dot(new[1], mean) > 0
     h, g, a, b, c, d, gain, ends = (x[good] for x in (h, g, a, b, c, d, gain, ends))
+    # independent flips: the best one of both of its triangles, and one per new edge
     best = np.zeros(len(faces))
     np.maximum.at(best, face[h], gain)
     np.maximum.at(best, face[g], gain)
@@ -61,7 +64,7 @@ def _flip_once(v: np.ndarray, faces: np.ndarray, allowed: np.ndarray, min_cosine
 
 
 def _first_use(pairs: np.ndarray) -> np.ndarray:
-    """Rows of pairs (n, 2) in which both numbers appear for the first time."""
+    """Return the rows of pairs (n, 2) in which both numbers appear for the first time."""
     _, first = np.unique(pairs.ravel(), return_index=True)
     new = np.zeros(pairs.size, dtype=bool)
     new[first] = True
@@ -69,28 +72,31 @@ def _first_use(pairs: np.ndarray) -> np.ndarray:
 
 
 def _angle(v: np.ndarray, tip: np.ndarray, p: np.ndarray, q: np.ndarray) -> np.ndarray:
+    """Return the angles (n,) at `tip` between p and q, radians."""
     x, y = v[p] - v[tip], v[q] - v[tip]
     return np.arctan2(np.linalg.norm(np.cross(x, y), axis=1), _dot(x, y))
 
 
 def _normal(v: np.ndarray, a: np.ndarray, b: np.ndarray, c: np.ndarray) -> np.ndarray:
+    """Return unit normals (n, 3) of triangles a, b, c."""
     n = np.cross(v[b] - v[a], v[c] - v[a])
     return n / np.maximum(np.linalg.norm(n, axis=1, keepdims=True), 1e-30)
 
 
 def _dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Return dot products (n,) of rows."""
     return np.einsum("nd,nd->n", a, b)
 
 
 def mean_of_neighbours(mesh: Mesh) -> csr_array:
-    """(N, N) the operator that replaces every vertex by the mean of its neighbours."""
+    """Build the operator (N, N) that replaces every vertex by the mean of its neighbours."""
     adjacency = mesh.vertex_adjacency
     degree = np.maximum(np.asarray(adjacency.sum(axis=1)).ravel(), 1)
     return csr_array(adjacency.multiply(1 / degree[:, None]))
 
 
 def relax(mesh: Mesh, surface: Surface, rounds: int) -> Mesh:
-    """Vertices moved towards the middle of their neighbours along a surface, all but those on the border."""
+    """Move vertices, except on borders, towards the mean of their neighbours along a surface."""
     free = np.ones(len(mesh.vertices), dtype=bool)
     free[mesh.boundary_vertices] = False
     mean = mean_of_neighbours(mesh)
@@ -106,9 +112,9 @@ def relax(mesh: Mesh, surface: Surface, rounds: int) -> Mesh:
 
 
 def smooth_taubin(mesh: Mesh, rounds: int) -> Mesh:
-    """Noise taken off without shrinking, by steps forward and back [Taubin].
+    """Smooth a mesh without shrinking, by steps forward and back [Taubin].
 
-    A border is smoothed as the curve it is.
+    A border is smoothed as a curve.
     """
     border = mesh.edges[mesh.edge_use == 1]
     inner = np.ones(len(mesh.vertices), dtype=bool)
@@ -123,13 +129,13 @@ def smooth_taubin(mesh: Mesh, rounds: int) -> Mesh:
     free = degree > 0
     vertices = np.array(mesh.vertices)
     for _ in range(rounds):
-        for step in (0.5, -0.53):
+        for step in (0.5, -0.53):                         # the step back is a little larger, against shrinking
             vertices[free] += step * (mean @ vertices - vertices)[free]
     return mesh.with_vertices(vertices)
 
 
 def improve_triangles(mesh: Mesh, surface: Surface, keep: np.ndarray | None = None) -> Mesh:
-    """Slivers turned into well-shaped triangles on a surface; their number stays, and the places of vertices `keep`."""
+    """Improve the shape of triangles on a surface; their number and the positions of vertices `keep` stay."""
     fixed = np.zeros(0, dtype=np.int64) if keep is None else keep
     places = mesh.vertices[fixed]
     for _ in range(6):
@@ -141,13 +147,13 @@ def improve_triangles(mesh: Mesh, surface: Surface, keep: np.ndarray | None = No
 
 
 def clamp_cotangents(mesh: Mesh) -> csr_array:
-    """(N, N) Laplacian, rows summing to 0, whose off-diagonal weights stay positive on any triangles."""
+    """Build a cotangent Laplacian (N, N), rows summing to 0, with clamped weights that stay positive."""
     rows, cols, values = [], [], []
     for corner in range(3):
         tip, p, q = (mesh.faces[:, (corner + i) % 3] for i in range(3))
         x, y = mesh.vertices[p] - mesh.vertices[tip], mesh.vertices[q] - mesh.vertices[tip]
         area = np.maximum(np.linalg.norm(np.cross(x, y), axis=1), 1e-30)
-        weight = np.clip(_dot(x, y) / area, 0.02, 20) / 2
+        weight = np.clip(_dot(x, y) / area, 0.02, 20) / 2      # cotangents of 89 to 3 degrees
         rows += [p, q]
         cols += [q, p]
         values += [weight, weight]

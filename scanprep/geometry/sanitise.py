@@ -1,6 +1,6 @@
-"""A scan made sound: degenerate and repeated triangles dropped, inverted ones turned to face outward.
+"""Clean the triangles of a scan: drop degenerate and duplicate ones, and orient them outward.
 
-Only triangles change. Vertices stay, with their order: masks, colours and landmark files refer to their numbers.
+Only triangles change. Vertices keep their order, because masks, colours and landmark files refer to their numbers.
 """
 from __future__ import annotations
 
@@ -17,32 +17,32 @@ from .places import distinct_rows
 from .sparse import label_components
 from .surface import Rays
 
-SAMPLES = 400            # triangles of each patch that look for what is in front of them and behind
+SAMPLES = 400            # triangles per patch that cast rays to the front and the back; enough for a clear vote
 
 
 def sanitise(scan: Mesh, name: str = "scan") -> Mesh:
-    """Drop what is no surface and turn what is inside out.
+    """Drop bad triangles, and orient the others outward.
 
-    Triangles without area, repeated triangles and flaps (a triangle and its reverse on an edge of their own) are
-    dropped; of a two-sided surface one side stays. Neighbours are made to face the same way, and each patch the way
-    that less of the scan hides: an open shell is seen from outside.
+    Degenerate triangles, duplicates and flaps (a triangle and its reverse on an edge of their own) are dropped. Of a
+    two-sided surface one side stays. Neighbours are oriented alike. Each patch faces the side where less of the scan
+    occludes it, so an open shell is seen from outside.
 
     Parameters
     ----------
     scan : Mesh
         In any unit.
     name : str
-        What the warning calls it: its file, or the argument.
+        Name of the scan in the warning: its file, or the argument.
 
     Returns
     -------
     Mesh
-        The very same object where nothing was wrong. A UserWarning tells what was dropped and turned, in one line.
+        The same object if nothing was wrong. A UserWarning says in one line what was dropped and inverted.
 
     Examples
     --------
-    >>> from scanprep.synthetic.people import Person
-    >>> body = Person().mesh
+    >>> from scanprep.synthetic.people import SyntheticPerson
+    >>> body = SyntheticPerson().mesh
     >>> sanitise(body) is body
     True
     """
@@ -52,7 +52,7 @@ def sanitise(scan: Mesh, name: str = "scan") -> Mesh:
     one_place = scan if place is None else Mesh(scan.vertices, place[scan.faces])
     keep, notes = _surface_triangles(one_place)
     if not keep.any():
-        return scan                          # nothing but lines: whoever needs a surface says so
+        return scan                          # only degenerate triangles: callers that need a surface raise
     kept = one_place if keep.all() else Mesh(scan.vertices, one_place.faces[keep])
     invert, patch = invert_against_neighbours(kept)
     invert ^= _inside_out(Mesh(kept.vertices, invert_triangles(kept.faces, invert)) if invert.any() else kept, patch)
@@ -66,28 +66,28 @@ def sanitise(scan: Mesh, name: str = "scan") -> Mesh:
 
 
 def invert_triangles(faces: np.ndarray, which: np.ndarray) -> np.ndarray:
-    """Triangles (F, 3), some of them, (F,) bool, seen from the other side; their first corner stays."""
+    """Invert some triangles, (F,) bool, of (F, 3); their first corner stays."""
     return np.where(which[:, None], faces[:, [0, 2, 1]], faces)
 
 
 def _surface_triangles(mesh: Mesh) -> tuple[np.ndarray, list[str]]:
-    """Which triangles (F,) bool are surface, and what the others are."""
+    """Find triangles (F,) bool that are surface, and describe the others in words."""
     sides = mesh.corners - np.roll(mesh.corners, -1, axis=1)
     longest = np.einsum("fsd,fsd->fs", sides, sides).max(axis=1)
-    # area over squared longest side: float32 files leave no flatter triangle that has a normal
+    # area over squared longest side: flatter triangles have no normal in float32 files
     flat = mesh.face_areas <= 1e-9 * longest
     notes = [f"{number_of(flat.sum(), 'triangle')} without area dropped"] if flat.any() else []
     group = distinct_rows(np.sort(mesh.faces, axis=1))
     if group is None:
         return ~flat, notes
-    # Of equal triangles the first stays; those that face the other way make their group two-sided.
+    # of equal triangles the first stays; a reversed one makes its group two-sided
     a, b, c = mesh.faces.T
     odd = (a > b) ^ (b > c) ^ (a > c)
     keep = ~flat & (group == np.arange(len(group)))
     repeated = ~flat & ~keep
     two_sided = np.zeros(len(keep), dtype=bool)
     two_sided[group[repeated & (odd != odd[group])]] = True
-    # A flap hangs on one vertex alone, or on an edge that two other triangles share.
+    # a flap is attached at one vertex only, or at an edge that two other triangles share
     rest = Mesh(mesh.vertices, mesh.faces[keep])
     use = rest.edge_use[rest.face_edges]
     flap = np.zeros(len(keep), dtype=bool)
@@ -103,10 +103,10 @@ def _surface_triangles(mesh: Mesh) -> tuple[np.ndarray, list[str]]:
 
 
 def invert_against_neighbours(mesh: Mesh) -> tuple[np.ndarray, np.ndarray]:
-    """Which triangles (F,) bool to invert so that neighbours face the same way, and the patch (F,) each belongs to.
+    """Find triangles (F,) bool to invert so that neighbours face the same way, and the patch (F,) of each.
 
-    In every patch most of its area stays as it is. Patches end at edges with more than two triangles. One that has a
-    single side only, as a Möbius strip has, stays as it is.
+    In every patch most of the area stays as it is. Patches end at edges with more than two triangles. A one-sided
+    patch, such as a Möbius strip, stays as it is.
     """
     count = len(mesh.faces)
     first, second = mesh.side_pairs.T
@@ -115,7 +115,7 @@ def invert_against_neighbours(mesh: Mesh) -> tuple[np.ndarray, np.ndarray]:
         return np.zeros(count, dtype=bool), label_components(a, b, count)
     forward = (mesh.faces < np.roll(mesh.faces, -1, axis=1)).ravel()
     agree = forward[first] != forward[second]
-    # Every triangle is there twice, as it is and inverted; what faces the same way hangs together.
+    # graph with two nodes per triangle, as it is and inverted; links join nodes with the same orientation
     rows, columns = np.r_[a, a + count], np.r_[np.where(agree, b, b + count), np.where(agree, b + count, b)]
     patch = label_components(rows, columns, 2 * count)
     as_is, turned = patch[:count], patch[count:]
@@ -126,32 +126,31 @@ def invert_against_neighbours(mesh: Mesh) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _inside_out(mesh: Mesh, patch: np.ndarray) -> np.ndarray:
-    """(F,) bool: triangles of the patches (F,) whose front the scan hides more often than their back.
+    """Find triangles (F,) bool of patches (F,) whose front is occluded by the scan more often than their back.
 
-    From a triangle of a body, or of a shell of one, rays to the outside leave; those to the inside meet the far side.
+    Rays from a body, or from a shell of one, to the outside leave; rays to the inside meet the far side.
     """
     rng = np.random.default_rng(0)
-    # Some triangles of every patch, drawn without respect to size: their areas weigh the votes.
+    # sample triangles of every patch at random; votes are weighted by area
     order = rng.permutation(len(patch))
     order = order[np.argsort(patch[order], kind="stable")]
     size = np.bincount(patch)
     rank = np.arange(len(order)) - np.repeat(np.cumsum(size) - size, size)
-    # rays of each, to either side
-    some = np.repeat(order[rank < SAMPLES], 4)
-    # of the diagonal, that a ray goes: through a trunk, but not across a room
-    around, reach = _directions(mesh.face_normals[some], rng), 0.15 * float(np.linalg.norm(np.ptp(
+    # four rays per triangle, to either side
+    sample = np.repeat(order[rank < SAMPLES], 4)
+    # rays reach 15% of the diagonal: through a trunk, but not across a room
+    around, reach = _directions(mesh.face_normals[sample], rng), 0.15 * float(np.linalg.norm(np.ptp(
         mesh.vertices, axis=0)))
-    start, off = mesh.corners[some].mean(axis=1), 1e-4 * reach * mesh.face_normals[some]
+    start, off = mesh.corners[sample].mean(axis=1), 1e-4 * reach * mesh.face_normals[sample]
     rays = Rays(mesh)
     vote = rays.test_occlusion(start + off, around, reach).astype(float) - rays.test_occlusion(start - off, -around,
                                                                                                reach)
-    vote *= mesh.face_areas[some]
-    # The sum of the votes against what it would be if each were as likely the other way.
-    total = np.bincount(patch[some], vote, len(size))
-    spread = np.sqrt(np.bincount(patch[some], vote**2, len(size)))
-    share = total / np.maximum(np.bincount(patch[some], mesh.face_areas[some], len(size)), 1e-300)
-    # share of the rays by which the front must be hidden more often than the back
-    # standard deviations by which that must differ from chance
+    vote *= mesh.face_areas[sample]
+    # compare the sum of votes with its standard deviation by chance
+    total = np.bincount(patch[sample], vote, len(size))
+    spread = np.sqrt(np.bincount(patch[sample], vote**2, len(size)))
+    share = total / np.maximum(np.bincount(patch[sample], mesh.face_areas[sample], len(size)), 1e-300)
+    # clear votes: more than 5% of the rays, and five standard deviations
     known = (np.abs(share) > 0.05) & (np.abs(total) > 5.0 * spread)
     turn = known & (total > 0)
     if turn.any() and not known.all():
@@ -162,36 +161,36 @@ def _inside_out(mesh: Mesh, patch: np.ndarray) -> np.ndarray:
 
 
 def _agree_with_camera(mesh: Mesh, rays: Rays, patch: np.ndarray, turn: np.ndarray) -> np.ndarray:
-    """(P,) bool: the patches to turn, where all that is there was seen by one camera.
+    """Correct which patches (P,) bool to invert if the whole scan was seen by one camera.
 
-    Its noise and the steps in depth hide the front as often as the back. But all that it saw faces it, so patches
-    which would not all face one way are turned by the camera instead, the way that most of the scan faced.
+    Its noise and depth steps occlude the front as often as the back. But everything it saw faces it. So if the patches
+    would not all face one way, they are oriented towards the camera, on the side that most of the scan faced.
     """
-    # From where nearly everything is in sight; from behind a sheet it is too, so the side is not known.
+    # from which of 26 directions is nearly everything visible? Of a sheet also from behind, so the sign is open
     grid = np.array(list(itertools.product((-1.0, 0.0, 1.0), repeat=3)))
     ways = grid[grid.any(axis=1)] / np.linalg.norm(grid[grid.any(axis=1)], axis=1, keepdims=True)
-    some = np.random.default_rng(0).permutation(len(patch))[:SAMPLES]
-    middle, area = mesh.corners[some].mean(axis=1), mesh.face_areas[some]
+    sample = np.random.default_rng(0).permutation(len(patch))[:SAMPLES]
+    middle, area = mesh.corners[sample].mean(axis=1), mesh.face_areas[sample]
     size = float(np.linalg.norm(np.ptp(mesh.vertices, axis=0)))
-    # of the diagonal, above a triangle: farther than the noise of a depth camera
-    sights = [np.average(~rays.test_occlusion(middle + 2e-3 * size * way, np.tile(way, (len(some), 1)), size),
+    # rays start 0.2% of the diagonal above a triangle, farther than the noise of a depth camera
+    sights = [np.average(~rays.test_occlusion(middle + 2e-3 * size * way, np.tile(way, (len(sample), 1)), size),
                          weights=area)
               for way in ways]
-    # of a scan from one side: one view has 0.89 and more, a whole body a half
+    # a single view has 0.89 and more, a whole body a half
     if max(sights) < 0.8:
         return turn
     along = mesh.face_areas * (mesh.face_normals @ ways[int(np.argmax(sights))])
     facing = np.where(turn[patch], -along, along)
-    # share by which areas must face one way rather than the other; half views have 0.75 and more
+    # already consistent: half views have 0.75 and more of the area facing one way
     if abs(facing.sum()) > 0.6 * np.abs(facing).sum():
         return turn
     return np.bincount(patch, along * np.sign(along.sum())) < 0
 
 
 def _against_nearest(mesh: Mesh, patch: np.ndarray, known: np.ndarray, turn: np.ndarray) -> np.ndarray:
-    """(P,) bool: patches that face against the nearest triangles of patches of which the side is known.
+    """Find patches (P,) bool that face against the nearest triangles of patches with a known side.
 
-    For small and flat ones, in a scan whose triangles are known to face both ways.
+    For small and flat patches, in a scan with triangles of both orientations.
     """
     middle, sure = mesh.corners.mean(axis=1), known[patch]
     asked = np.flatnonzero(~sure)
@@ -202,7 +201,7 @@ def _against_nearest(mesh: Mesh, patch: np.ndarray, known: np.ndarray, turn: np.
 
 
 def _directions(normals: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Unit vectors (n, 3) on the side of normals (n, 3), more often along them (by the cosine)."""
+    """Draw unit vectors (n, 3) in the hemispheres of normals (n, 3), with cosine weighting."""
     around = rng.normal(size=normals.shape)
     around = normals + around / np.linalg.norm(around, axis=1, keepdims=True)
     length = np.linalg.norm(around, axis=1, keepdims=True)

@@ -1,4 +1,4 @@
-"""Seams: where a file repeats vertices, for flat shading or a chart of textures, and so cuts its surface apart."""
+"""Close seams: borders along which a file repeats vertices, for flat shading or texture charts."""
 from __future__ import annotations
 
 import numpy as np
@@ -7,10 +7,10 @@ from .sparse import label_components
 
 
 def seams_closed(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray | None:
-    """Which vertex (N,) int, of those that are left, each vertex is where the seams of a mesh are closed.
+    """Find the merged vertex (N,) int of each vertex when the seams of a mesh are closed; None without any seam.
 
-    A seam is where two borders run through the very same places; nothing else is merged, so meshes without seams keep
-    their vertices, also those that touch, and the vertices that are left keep their order. None without any seam.
+    A seam is where two borders run through exactly the same positions. Nothing else is merged, so other touching
+    vertices stay, and the remaining vertices keep their order.
     """
     ends = _border(faces, len(vertices))
     if not len(ends):
@@ -19,6 +19,7 @@ def seams_closed(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray | None:
     used = np.unique(ends)
     rows = np.ascontiguousarray(vertices[used] + 0.0, dtype=np.float64)           # + 0.0: minus zero is zero
     place[used] = np.unique(rows.view(np.dtype((np.void, 24))).ravel(), return_inverse=True)[1]
+    # border edges with equal positions at both ends are two sides of a seam
     ends = np.where((place[ends[:, 0]] > place[ends[:, 1]])[:, None], ends[:, ::-1], ends)
     ends = ends[place[ends[:, 0]] < place[ends[:, 1]]]
     key = place[ends[:, 0]] * len(vertices) + place[ends[:, 1]]
@@ -33,7 +34,7 @@ def seams_closed(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray | None:
 
 
 def _border(faces: np.ndarray, count: int) -> np.ndarray:
-    """(B, 2) the edges of one triangle only."""
+    """Return the edges (B, 2) with one triangle only."""
     half = faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
     key = half.min(axis=1) * count + half.max(axis=1)
     order = np.argsort(key)
@@ -42,7 +43,7 @@ def _border(faces: np.ndarray, count: int) -> np.ndarray:
 
 
 def mean_of_merged(values: np.ndarray, vertex_of: np.ndarray) -> np.ndarray:
-    """(n, k) the mean over the vertices that became one; `values` (N, k), `vertex_of` (N,) as of `seams_closed`."""
+    """Average values (N, k) over merged vertices (n, k); `vertex_of` (N,) as from `seams_closed`."""
     total = np.zeros((vertex_of.max() + 1, values.shape[1]))
     np.add.at(total, vertex_of, values)
     return total / np.bincount(vertex_of)[:, None]

@@ -10,7 +10,7 @@ _OTHER = {"L": "R", "R": "L", "l": "r", "r": "l", "left": "right", "right": "lef
 
 
 def other_side(label: str) -> str | None:
-    """The label of the same place on the other side, or None for a label that names no side.
+    """Return the label of the same place on the other side; None for a label without a side.
 
     Sides are an L or R in front (LELB, L.Knee), one at the end (elbow_l, KneeR), or the words left, right,
     Lt. and Rt. (knee_left, LeftKnee).
@@ -23,13 +23,13 @@ def other_side(label: str) -> str | None:
 
 
 def side_of(label: str) -> int:
-    """1 for a label of the left, -1 for the right, 0 for one that names no side."""
+    """Return 1 for a label of the left, -1 of the right, 0 without a side."""
     found = _WORDS.search(label) or _LETTER.search(label)
     return 0 if found is None else 1 if found[0][0] in "lL" else -1
 
 
 def split_side(label: str) -> tuple[str, str]:
-    """A label without its side, and "left", "right" or "" for the side: ("hand", "left") for l_hand and hand_left."""
+    """Split a label into name and side, "left", "right" or "": ("hand", "left") for l_hand and hand_left."""
     found = _WORDS.search(label) or _LETTER.search(label)
     if found is None:
         return label, ""
@@ -38,6 +38,6 @@ def split_side(label: str) -> tuple[str, str]:
 
 
 def _like(word: str) -> str:
-    """The other word, in the same case."""
+    """Return the word for the other side, in the same case."""
     other = _OTHER[word.lower()]
     return other.upper() if word.isupper() else other.capitalize() if word[0].isupper() else other

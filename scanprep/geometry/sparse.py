@@ -1,4 +1,4 @@
-"""Sums over groups, different numbers, and symmetric positive definite systems, factored once and solved many times."""
+"""Sums over groups, unique integers, graphs, and sparse symmetric positive definite systems."""
 from __future__ import annotations
 
 import math
@@ -12,24 +12,24 @@ from scipy.sparse.linalg import splu
 
 
 def gatherer(index: np.ndarray, count: int) -> csr_array:
-    """The matrix (count, n) that sums the values of each index (n,)."""
+    """Build the matrix (count, n) that sums values by index (n,)."""
     n = len(index)
     return csr_array(coo_array((np.ones(n), (index, np.arange(n))), shape=(count, n)))
 
 
 def sum_groups(gather: csr_array, values: np.ndarray) -> np.ndarray:
-    """(count, ...) what a `gatherer` makes of values (n, ...)."""
+    """Sum values (n, ...) by groups with a `gatherer` into (count, ...)."""
     return (gather @ values.reshape(len(values), math.prod(values.shape[1:]))).reshape(-1, *values.shape[1:])
 
 
 def unique_integers(numbers: np.ndarray) -> np.ndarray:
-    """The different integers (k,) among some, ascending.
+    """Return the unique integers (k,), ascending.
 
-    Sorted; NumPy's `unique` hashes integers since 2.3, which takes 25 times as long for a million of them.
+    By sorting: NumPy's `unique` hashes integers since 2.3, which takes 25 times as long for a million of them.
 
     Examples
     --------
-    >>> distinct(np.array([[3, 1], [1, 2]])).tolist()
+    >>> unique_integers(np.array([[3, 1], [1, 2]])).tolist()
     [1, 2, 3]
     """
     ordered = np.sort(numbers, axis=None)
@@ -39,11 +39,11 @@ def unique_integers(numbers: np.ndarray) -> np.ndarray:
 
 
 def label_components(a: np.ndarray, b: np.ndarray, count: int) -> np.ndarray:
-    """The number (count,) of the piece that each of so many things is in, which links from a (n,) to b (n,) join.
+    """Label the connected components (count,) of `count` nodes with links from a (n,) to b (n,).
 
     Examples
     --------
-    >>> connected_pieces(np.array([0, 3]), np.array([1, 1]), 4).tolist()
+    >>> label_components(np.array([0, 3]), np.array([1, 1]), 4).tolist()
     [0, 0, 1, 0]
     """
     links = coo_array((np.ones(len(a), dtype=bool), (a, b)), shape=(count, count))
@@ -51,10 +51,10 @@ def label_components(a: np.ndarray, b: np.ndarray, count: int) -> np.ndarray:
 
 
 def factor(matrix: csc_array) -> Callable[[np.ndarray], np.ndarray]:
-    """The solver, (n,) or (n, k) -> the same shape, of a sparse symmetric positive definite matrix, with SuperLU.
+    """Factor a sparse symmetric positive definite matrix with SuperLU; return the solver for (n,) or (n, k).
 
-    Symmetric mode and no pivoting: with its default pivoting SuperLU fills in beyond use on the larger
-    systems of this package. ValueError for a singular matrix or one that is not finite.
+    Symmetric mode without pivoting: default pivoting makes far too much fill-in on the larger systems here. ValueError
+    for a singular matrix or one that is not finite.
     """
     try:
         lu = splu(csc_array(matrix), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0,
@@ -67,11 +67,11 @@ def factor(matrix: csc_array) -> Callable[[np.ndarray], np.ndarray]:
 class Factored:
     """A factored SPD system for many right-hand sides (CHOLMOD-class supernodal Cholesky from cholespy).
 
-    Slower to factor than `factor`, several times faster to solve with three or more columns. Pickled, it is the matrix,
-    and factored again where it is read. ValueError as for `factor`, and for an empty matrix.
+    Slower to factor than `factor`, but several times faster to solve with three or more columns. Pickling stores the
+    matrix, which is factored again on loading. ValueError as for `factor`, and for an empty matrix.
     """
 
-    LIMIT = 128                      # columns cholespy takes in one call
+    LIMIT = 128                      # most columns that cholespy takes in one call
 
     def __init__(self, matrix: csc_array) -> None:
         from cholespy import CholeskySolverD, MatrixType
@@ -103,10 +103,10 @@ class Factored:
 
 
 def harmonic(near: csr_array, values: np.ndarray, known: np.ndarray) -> np.ndarray:
-    """Values (N, k) that go over smoothly from the known ones (N,) bool: each other the mean of its neighbours'.
+    """Interpolate values (N, k) harmonically from the known ones (N,) bool: each is the mean of its neighbours.
 
-    So none lies beyond the known ones. A piece without any known value keeps what it has. `near` (N, N), symmetric,
-    says how much neighbours count for each other.
+    So none exceeds the known ones. A component without known values keeps its values. `near` (N, N), symmetric, are the
+    weights of neighbours.
     """
     _, piece = connected_components(near, directed=False)
     free, fixed = np.flatnonzero(~known & np.isin(piece, np.unique(piece[known]))), np.flatnonzero(known)
@@ -118,17 +118,16 @@ def harmonic(near: csr_array, values: np.ndarray, known: np.ndarray) -> np.ndarr
 
 
 def solve_smooth(blocks: np.ndarray, stiffness: np.ndarray | float, rhs: np.ndarray) -> np.ndarray:
-    """Frames x (T, P) that their second differences couple: `blocks[t] x[t] + stiffness (D₂ᵀ D₂ x)[t] = rhs[t]`.
+    """Solve for frames x (T, P) coupled by second differences: `blocks[t] x[t] + stiffness (D₂ᵀ D₂ x)[t] = rhs[t]`.
 
-    Right-hand sides (T, P, m) are solved for together.
-
-    `blocks` (T, P, P) are symmetric and positive semidefinite, `stiffness` is (P,) or one number, T at least 3: one
-    Cholesky factorisation of a band of width 2 P.
+    `blocks` (T, P, P) are symmetric and positive semidefinite, `stiffness` is (P,) or one number, T at least 3. One
+    banded Cholesky factorisation of width 2 P solves all right-hand sides (T, P, m).
     """
     T, P = rhs.shape[:2]
     lower = np.zeros((2 * P + 1, T * P))
     for k in range(P):                               # entries k below the diagonal, inside the blocks
         lower[k].reshape(T, P)[:, :P - k] = np.einsum("tii->ti", blocks[:, k:, :P - k])
+    # add the band of D₂ᵀ D₂, and a tiny ridge for unknowns without data
     D = np.array([1.0, -2.0, 1.0])
     for i in range(3):
         for j in range(i, 3):
@@ -139,9 +138,9 @@ def solve_smooth(blocks: np.ndarray, stiffness: np.ndarray | float, rhs: np.ndar
 
 
 def overlapping_windows(count: int, size: int, overlap: int) -> Iterator[tuple[slice, slice, slice]]:
-    """Windows over so many frames, at least 3, for `solve_smooth`: frames to solve, which of these to keep, and where.
+    """Yield windows over `count` frames, at least 3, for `solve_smooth`: frames to solve, which to keep, and where.
 
-    Each lends `overlap` frames to its neighbours, more than a frame's influence reaches.
+    Neighbouring windows overlap by `overlap` frames, more than the influence of a frame reaches.
     """
     for start in range(0, count, size):
         near = slice(max(0, min(start - overlap, count - 3)), min(count, start + size + overlap))
@@ -170,7 +169,7 @@ def conjugate_gradients(apply: Callable[[np.ndarray], np.ndarray], force: np.nda
 
 
 def spanning_tree(i: np.ndarray, j: np.ndarray, lengths: np.ndarray, n: int) -> csr_array:
-    """The edges of least total length that link n points as far as the given edges do.
+    """Find a minimum spanning tree of n points, or a forest if the edges do not connect all.
 
     Parameters
     ----------

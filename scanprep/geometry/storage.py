@@ -1,6 +1,6 @@
-"""Stored files: JSON, and `.npz` files of named arrays and a JSON header with kind and version; never pickle.
+"""Read and write JSON, and `.npz` files of named arrays with a JSON header of kind and version; never pickle.
 
-Whatever is wrong with a file is a StorageError that names it, and a small file never asks for much memory.
+Every problem with a file is a StorageError that names it. A small file never makes the reader use much memory.
 """
 from __future__ import annotations
 
@@ -18,24 +18,24 @@ from typing import IO, Any
 import numpy as np
 
 HEADER = "header"
-LARGEST = 1e30                       # number that still has a square: what is larger counts as infinite
-LARGEST_TEXT = 2**28                 # bytes of a JSON file or a table
+LARGEST = 1e30                       # larger numbers count as infinite: their squares may overflow
+LARGEST_TEXT = 2**28                 # bytes: larger JSON files and tables are refused
 
 
 class StorageError(ValueError):
-    """A file that is missing, damaged, or of another kind or version: which one, what was expected, what came."""
+    """A missing or damaged file, or one of another kind or version; names the file, what was expected and what came."""
 
 
 class ObjectsError(ValueError):
-    """An array of Python objects, which only a pickle could bring back."""
+    """An array of Python objects, which only a pickle could restore."""
 
 
 @contextlib.contextmanager
 def taking_apart(path: str | Path, what: str, error: type[StorageError] = StorageError) -> Iterator[None]:
-    """Whatever goes wrong inside is an `error` that names the file: damaged ones fail in too many ways to list."""
+    """Convert any exception inside to an `error` that names the file: damaged files fail in many ways."""
     try:
         yield
-    except StorageError:                 # says already which file
+    except StorageError:                 # names the file already
         raise
     except FileNotFoundError:
         raise error(f"{path}: no such file; expected {what}") from None
@@ -44,7 +44,7 @@ def taking_apart(path: str | Path, what: str, error: type[StorageError] = Storag
 
 
 def _reason(problem: Exception) -> str:
-    """What went wrong, in one short line."""
+    """Describe an exception in one short line."""
     if isinstance(problem, KeyError):
         return f"it lacks {problem}"
     if isinstance(problem, RecursionError):
@@ -56,7 +56,7 @@ def _reason(problem: Exception) -> str:
 
 
 def check_regular(path: str | Path, error: type[StorageError] = StorageError, what: str = "a file") -> None:
-    """An `error` for what is no plain file: missing, a folder, or a pipe or device, which may never end."""
+    """Raise `error` for what is no regular file: missing, a folder, or a pipe or device, which may never end."""
     try:
         mode = os.stat(path).st_mode
     except FileNotFoundError:
@@ -68,10 +68,10 @@ def check_regular(path: str | Path, error: type[StorageError] = StorageError, wh
 
 
 def path_inside(folder: str | Path, name: object, source: str | Path) -> Path:
-    """The file of a folder that another file names, which must lie in that folder.
+    """Return the path of a file that another file names; it must be inside a folder.
 
-    Folders of results travel: what their records name may be anything. So a name is a relative path without `..`,
-    and no link on the way leads out of the folder.
+    Folders of results are shared, and their records may name anything. So a name must be a relative path without `..`,
+    and no link may lead out of the folder.
 
     Parameters
     ----------
@@ -100,7 +100,7 @@ def path_inside(folder: str | Path, name: object, source: str | Path) -> Path:
     refused = StorageError(f"{source}: expected the name of a file inside {folder}, found {name!r}")
     if not isinstance(name, str) or not name or "\0" in name:
         raise refused
-    # The rules of Windows are the stricter ones: drives, and a backslash that separates.
+    # the rules of Windows are stricter: drives, and backslashes as separators
     parts = PureWindowsPath(name)
     if parts.drive or parts.root or ".." in parts.parts:
         raise refused
@@ -113,21 +113,21 @@ def path_inside(folder: str | Path, name: object, source: str | Path) -> Path:
 
 
 def read_bytes(path: str | Path, what: str = "a file", error: type[StorageError] = StorageError) -> bytes:
-    """All of a file, or an `error` that names it."""
+    """Read a whole file; raise `error` with its name on any problem."""
     check_regular(path, error, what)
     with taking_apart(path, what, error):
         return Path(path).read_bytes()
 
 
 def write_file(path: str | Path, data: bytes | str) -> None:
-    """Write a file, whole or not at all; text as UTF-8, and as `\\udce9` what is none of it in the name of a file."""
+    """Write a file, atomically; text as UTF-8, with undecodable characters of file names as `\\udce9`."""
     with writing(path) as beside:
         beside.write_bytes(data.encode("utf-8", "backslashreplace") if isinstance(data, str) else data)
 
 
 @contextlib.contextmanager
 def writing(path: str | Path) -> Iterator[Path]:
-    """A temporary path beside `path` that takes its place when the block ends well; until then the old file stays."""
+    """Yield a temporary path that replaces `path` when the block succeeds; until then the old file stays."""
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     beside = path.with_name(f".{path.stem}.{os.getpid()}.part{path.suffix}")
@@ -139,7 +139,7 @@ def writing(path: str | Path) -> Iterator[Path]:
 
 
 def text(arrays: Mapping[str, np.ndarray], name: str, usual: str) -> str:
-    """The one text of this name, `usual` where there is none; ValueError for anything else."""
+    """Return the text of this name, `usual` if there is none; ValueError for anything else."""
     value = arrays.get(name, np.array(usual))
     if value.size != 1 or value.dtype.kind not in "US":
         raise ValueError(f"{name}: expected one text, found {value.dtype} of shape {value.shape}")
@@ -147,16 +147,17 @@ def text(arrays: Mapping[str, np.ndarray], name: str, usual: str) -> str:
 
 
 def as_json(value: Any) -> Any:
-    """A value as it comes back from a JSON file of `write_json`: tuples as lists, keys as strings."""
+    """Return a value as `write_json` and `read_json` give it back: tuples as lists, keys as strings."""
     return json.loads(_json(value))
 
 
 def write_json(path: str | Path, value: Any) -> None:
-    """Write JSON, whole or not at all: dataclasses as tables, arrays as lists, null for what is not finite."""
+    """Write JSON, atomically: dataclasses as objects, arrays as lists, null for values that are not finite."""
     write_file(path, _json(value, 1) + "\n")
 
 
 def _json(value: Any, indent: int | None = None) -> str:
+    """Encode JSON, with null for values that are not finite."""
     try:
         return json.dumps(value, indent=indent, allow_nan=False, default=_plain)
     except ValueError:
@@ -165,7 +166,7 @@ def _json(value: Any, indent: int | None = None) -> str:
 
 
 def _plain(value: Any) -> Any:
-    """What JSON can hold of settings and figures."""
+    """Convert dataclasses, arrays and paths to what JSON can hold."""
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         return {f.name: getattr(value, f.name) for f in dataclasses.fields(value)}
     if isinstance(value, np.generic | np.ndarray):
@@ -176,13 +177,13 @@ def _plain(value: Any) -> Any:
 
 
 def read_json(path: str | Path, what: str, error: type[StorageError] = StorageError) -> Any:
-    """A JSON file of finite numbers; `what` was expected, for the error."""
+    """Read a JSON file of finite numbers; `what` says in errors what was expected."""
     return parse_json(path, read_bytes(path, what, error), what, error)
 
 
 def parse_json(path: str | Path, data: bytes, what: str, error: type[StorageError] = StorageError, nan: bool = False
                ) -> Any:
-    """The same of bytes that were read; `nan`: numbers need not be finite."""
+    """Parse JSON as `read_json` does; with `nan`, numbers need not be finite."""
     with taking_apart(path, f"{what} in JSON", error):
         if len(data) > LARGEST_TEXT:
             raise ValueError(f"{len(data)} bytes, more than {LARGEST_TEXT}")
@@ -197,6 +198,7 @@ UTF_16 = (b"\xff\xfe", b"\xfe\xff")
 
 
 def _number(text: str) -> float:
+    """Parse a finite number."""
     value = float(text)
     if not math.isfinite(value):
         raise ValueError(f"{text} is not a finite number")
@@ -205,13 +207,13 @@ def _number(text: str) -> float:
 
 def save(path: str | Path, kind: str, version: int, arrays: dict[str, np.ndarray],
          header: dict[str, Any] | None = None, compress: bool = True) -> None:
-    """Write arrays and a JSON header into one `.npz` file: what it holds and the number of its layout, for `load`."""
+    """Write arrays and a JSON header with kind and version into one `.npz` file, for `load`."""
     text = json.dumps({"kind": kind, "version": version, **(header or {})})
     save_arrays(path, {HEADER: np.array(text), **arrays}, compress)
 
 
 def save_arrays(path: str | Path, arrays: dict[str, np.ndarray], compress: bool = True) -> None:
-    """Write arrays into one `.npz` file; ValueError for one of objects, which only a pickle would hold."""
+    """Write arrays into one `.npz` file; ValueError for arrays of objects."""
     for name, array in arrays.items():                     # before NumPy 2.2 savez cannot refuse them itself
         if np.asarray(array).dtype.hasobject:
             raise ValueError(f"{path}: expected arrays of numbers or text, {name} holds objects")
@@ -221,40 +223,40 @@ def save_arrays(path: str | Path, arrays: dict[str, np.ndarray], compress: bool 
 
 def load_arrays(path: str | Path, what: str = "an .npz file", only: Collection[str] | None = None
                 ) -> dict[str, np.ndarray]:
-    """All arrays of an `.npz` file, or those of some names; StorageError when it is missing, damaged or holds objects.
-    """
+    """Read all arrays of an `.npz` file, or those of some names; StorageError if missing, damaged or with objects."""
     return _arrays(path, what, only)
 
 
 def names_in(path: str | Path, what: str = "an .npz file") -> tuple[str, ...]:
-    """The names of the arrays in an `.npz` file, without reading them; StorageError when it is missing or damaged."""
+    """List the names of the arrays in an `.npz` file, without reading them; StorageError if missing or damaged."""
     check_regular(path, what=what)
     with taking_apart(path, what), zipfile.ZipFile(path) as archive:
         return tuple(name[:-4] for name in archive.namelist() if name.endswith(".npy"))
 
 
 def load_array(path: str | Path) -> np.ndarray:
-    """The array of an `.npy` file, or StorageError when it is missing, damaged or holds objects."""
+    """Read the array of an `.npy` file; StorageError if it is missing, damaged or holds objects."""
     check_regular(path)
     with taking_apart(path, "an array of NumPy"), open(path, "rb") as stream:
         return _array(stream, os.fstat(stream.fileno()).st_size, "")
 
 
 def stored_kind(path: str | Path) -> str:
-    """The kind of a file of `save`, read from its header alone, or StorageError."""
+    """Read the kind of a file of `save` from its header; StorageError without one."""
     return str(load_header(path, "scapekit").get("kind"))
 
 
 def load_header(path: str | Path, kind: str) -> dict[str, Any]:
-    """The header alone of a file of `save`, whatever its kind and version; StorageError where there is none."""
+    """Read only the header of a file of `save`, of any kind and version; StorageError without one."""
     return _header(path, kind, _arrays(path, "an .npz file with a header", (HEADER,)).get(HEADER))
 
 
 def _arrays(path: str | Path, what: str, only: Collection[str] | None) -> dict[str, np.ndarray]:
-    """The arrays of an archive, or those of some names; numpy's own reader believes what a header promises."""
+    """Read arrays of an archive, with sizes checked; NumPy's own reader trusts the headers."""
     check_regular(path, what=what)
     with taking_apart(path, what), zipfile.ZipFile(path) as archive:
         members = {info.filename[:-4]: info for info in archive.infolist() if info.filename.endswith(".npy")}
+        # refuse decompression bombs: 128 MB plus 100 times the packed size, or too many arrays
         unpacked, packed = sum(info.file_size for info in members.values()), os.path.getsize(path)
         if unpacked > 2**27 + 100 * packed or len(members) > packed // 64:
             raise ValueError(f"{packed} bytes that would unpack to {len(members)} arrays of {unpacked} bytes")
@@ -269,12 +271,12 @@ def _arrays(path: str | Path, what: str, only: Collection[str] | None) -> dict[s
 
 
 def _array(stream: IO[bytes], size: int, name: str) -> np.ndarray:
-    """An array in numpy's format, whose header must promise what `size` bytes can hold."""
+    """Read an array in NumPy's format; its header must agree with `size` bytes."""
     try:
         version = np.lib.format.read_magic(stream)
         read = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}[version]
         shape, fortran, kind = read(stream)
-    except Exception:                    # numpy's words advise to allow pickles
+    except Exception:                    # NumPy's message advises to allow pickles
         raise ValueError(f"array {name}: its header is damaged") from None
     if kind.hasobject:
         raise ObjectsError(f"array {name}: expected numbers or text, found Python objects, which are not read here, "
@@ -293,9 +295,9 @@ def _array(stream: IO[bytes], size: int, name: str) -> np.ndarray:
 
 def numbers(arrays: Mapping[str, np.ndarray], name: str, *shape: int | None, finite: bool = True, kinds: str = "iuf"
             ) -> np.ndarray:
-    """The array of this name, of this shape (None: any length), of one of these kinds of numpy, and finite.
+    """Return the array of this name, checked for shape (None: any length), NumPy kind and finite values.
 
-    KeyError or ValueError when it is not; see `taking_apart`.
+    KeyError or ValueError otherwise; see `taking_apart`.
     """
     values = arrays[name]
     if values.dtype.kind not in kinds:
@@ -309,6 +311,7 @@ def numbers(arrays: Mapping[str, np.ndarray], name: str, *shape: int | None, fin
 
 
 def _header(path: str | Path, kind: str, stored: np.ndarray | None) -> dict[str, Any]:
+    """Parse a stored header; StorageError if it is missing or damaged."""
     if stored is None:
         raise StorageError(f"{path}: expected a {kind} file, found an .npz without a header")
     what = f"a {kind} file with a header in JSON"
@@ -320,7 +323,7 @@ def _header(path: str | Path, kind: str, stored: np.ndarray | None) -> dict[str,
 
 
 def load(path: str | Path, kind: str, versions: tuple[int, ...]) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
-    """Header and arrays of a file of `save` of this kind, in one of these versions; StorageError for any other."""
+    """Read header and arrays of a file of `save` of this kind and one of these versions; StorageError otherwise."""
     path = Path(path)
     arrays = load_arrays(path, f"a {kind} file")
     header = _header(path, kind, arrays.pop(HEADER, None))

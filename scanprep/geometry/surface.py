@@ -1,4 +1,4 @@
-"""Closest points on a surface, matches with compatible normals, rays, and what lines of sight tell about space."""
+"""Closest points on a surface, matches with compatible normals, ray casting, and free space of views."""
 from __future__ import annotations
 
 from collections.abc import Sequence
@@ -13,11 +13,11 @@ from .mesh import Mesh
 
 
 def check_points(points: np.ndarray, name: str = "points") -> np.ndarray:
-    """Query points (n, 3) as float64, in one block; ValueError for one too far away for any library."""
+    """Check query points (n, 3), and return them as contiguous float64; ValueError for points that are too far away."""
     points = np.ascontiguousarray(points, dtype=np.float64)
     if points.ndim != 2 or points.shape[1] != 3:
         raise ValueError(f"{name}: expected points of shape (n, 3), got shape {points.shape}")
-    farthest = 1e30  # metres; the square of what lies beyond, or its float32, is infinite
+    farthest = 1e30  # beyond it squares, or float32, overflow
     bad = np.flatnonzero(~(np.abs(points) < farthest).all(axis=1))
     if len(bad):
         raise ValueError(f"{name}: {len(bad)} points are not finite, or beyond {farthest:g} m; the first is number "
@@ -26,7 +26,7 @@ def check_points(points: np.ndarray, name: str = "points") -> np.ndarray:
 
 
 def check_surface(mesh: Mesh) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices and faces of a mesh that has some, in one block each; ValueError without a triangle."""
+    """Return vertices and faces of a mesh as contiguous arrays; ValueError without triangles."""
     if not len(mesh.faces):
         raise ValueError(f"mesh: expected at least one triangle, got {mesh}")
     return check_points(mesh.vertices, "mesh"), np.ascontiguousarray(mesh.faces)
@@ -42,12 +42,12 @@ class SurfacePoints:
     distances: np.ndarray       # (n,) metres, from the query points
 
     def transfer(self, vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-        """The same surface points (n, 3) on other vertices of the same triangulation."""
+        """Return the same surface points (n, 3) on other vertices of the same triangulation."""
         return np.einsum("nc,ncd->nd", self.bary, vertices[faces[self.faces]])
 
 
 class Surface:
-    """Closest-point queries on one mesh, which has triangles; its search tree is built once."""
+    """Closest-point queries on one mesh with triangles; the search tree is built once."""
 
     def __init__(self, mesh: Mesh) -> None:
         import igl
@@ -58,7 +58,7 @@ class Surface:
         self._tree.init(self._vertices, self._faces)
 
     def closest(self, points: np.ndarray) -> SurfacePoints:
-        """The point of the surface closest to each query point (n, 3); ValueError for one that is not finite."""
+        """Find the closest surface point to each query point (n, 3); ValueError for points that are not finite."""
         points = check_points(points)
         squared, face, closest = self._tree.squared_distance(self._vertices, self._faces, points)[:3]
         squared, face = np.asarray(squared).reshape(-1), np.asarray(face, dtype=np.int64).reshape(-1)
@@ -68,9 +68,9 @@ class Surface:
 
 
 def barycentric(points: np.ndarray, corners: np.ndarray) -> np.ndarray:
-    """Barycentric coordinates (n, 3) of points (n, 3) in the planes of triangles (n, 3, 3).
+    """Compute barycentric coordinates (n, 3) of points (n, 3) in the planes of triangles (n, 3, 3).
 
-    For a triangle without area, all weight is on its first corner.
+    For a degenerate triangle, all weight is on its first corner.
     """
     u, v = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
     w = points - corners[:, 0]
@@ -86,19 +86,19 @@ def barycentric(points: np.ndarray, corners: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Matches:
-    """For each query point a target point with a compatible normal, or none."""
+    """For each query point the match among the targets, or none."""
 
-    index: np.ndarray           # (n,) which target, -1 where none was acceptable
-    distances: np.ndarray       # (n,) metres; inf where there is none
+    index: np.ndarray           # (n,) index of the target, -1 for none
+    distances: np.ndarray       # (n,) metres; inf for none
 
     @property
     def valid(self) -> np.ndarray:
-        """(n,) bool"""
+        """(n,) bool: the query has a match."""
         return self.index >= 0
 
 
 class OrientedPoints:
-    """Nearest neighbours among points whose normals agree with the query's.
+    """Nearest neighbours among points with compatible normals.
 
     Points and normals are searched together in six dimensions: the squared distance is |x - y|² + scale² |n - m|²
     (scale in metres), so a point on the near side of a thin limb wins over a closer one on the far side.
@@ -112,13 +112,13 @@ class OrientedPoints:
 
     def match(self, points: np.ndarray, normals: np.ndarray, max_distance: float = np.inf,
               min_cosine: float = 0.5) -> Matches:
-        """The best target of each query (n, 3) with normals (n, 3); ValueError for one that is not finite."""
+        """Find the best target of each query (n, 3) with normals (n, 3); ValueError for values that are not finite."""
         points, normals = check_points(points), check_points(normals, "normals")
-        # what is farther away than this in six dimensions is too far, or faces away: the search may stop there
+        # a match farther than this in six dimensions is too far, or faces away: the search may stop there
         reach = np.hypot(max_distance, self.scale * np.sqrt(2 - 2 * min_cosine)) * (1 + 1e-9)
         _, index = self._tree.query(np.hstack([points, self.scale * normals]), distance_upper_bound=reach,
                                     workers=search_threads(len(points)))
-        index = np.minimum(index, len(self.points) - 1)            # nothing within reach: told apart below
+        index = np.minimum(index, len(self.points) - 1)            # nothing within reach; rejected below
         distances = np.linalg.norm(self.points[index] - points, axis=1)
         cosine = np.einsum("nd,nd->n", self.normals[index], normals)
         good = (distances <= max_distance) & (cosine >= min_cosine)
@@ -132,7 +132,7 @@ class Rays:
         from embreex import rtcore_scene
         from embreex.mesh_construction import TriangleMesh
 
-        # Embree works in float32: centre the mesh so that no accuracy is lost far from the origin.
+        # Embree works in float32: centre the mesh, so that no accuracy is lost far from the origin
         self._origin = mesh.vertices.mean(axis=0) if len(mesh.vertices) else np.zeros(3)
         self._scene = rtcore_scene.EmbreeScene()
         self._mesh = TriangleMesh(self._scene, (mesh.vertices - self._origin).astype(np.float32),
@@ -140,9 +140,9 @@ class Rays:
 
     def cast(self, origins: np.ndarray, directions: np.ndarray, reach: float = 1e6
              ) -> tuple[np.ndarray, np.ndarray]:
-        """First hits of rays (n, 3) with unit directions: triangle (n,), -1 for none, and distance (n,), NaN for none.
+        """Cast rays (n, 3) with unit directions: first triangle (n,), -1 for none, and distance (n,), NaN for none.
 
-        ValueError for a ray that is not finite: it would seem to hit nothing.
+        ValueError for a ray that is not finite, because it would seem to hit nothing.
         """
         origins = check_points(origins, "origins")
         along = check_points(np.broadcast_to(directions, origins.shape), "directions").astype(np.float32)
@@ -152,12 +152,12 @@ class Rays:
         return face, np.where(face >= 0, np.asarray(hit["tfar"], dtype=np.float64), np.nan)
 
     def test_occlusion(self, origins: np.ndarray, directions: np.ndarray, reach: float = 1e6) -> np.ndarray:
-        """(n,) bool: something lies within `reach` along each ray."""
+        """Test whether something lies within `reach` along each ray (n,)."""
         return self.cast(origins, directions, reach)[0] >= 0
 
 
 def mesh_and_camera(view: Any) -> tuple[Mesh, np.ndarray]:
-    """The surface and the camera position of a RangeView or a pair."""
+    """Return surface and camera position (3,), metres, of a RangeView or a pair."""
     mesh, camera = view if isinstance(view, tuple) else (view.mesh, view.camera)
     camera = np.asarray(camera, dtype=float)
     if not isinstance(mesh, Mesh) or camera.shape != (3,) or not np.isfinite(camera).all():
@@ -166,7 +166,7 @@ def mesh_and_camera(view: Any) -> tuple[Mesh, np.ndarray]:
 
 
 class SeenSpace:
-    """Space that views look through, as it is empty as far as the surface that was seen.
+    """Free space of views: between the camera and the surface that it saw.
 
     [VRIP] space carving
     """
@@ -175,7 +175,8 @@ class SeenSpace:
         self._views = [(Rays(mesh), camera) for mesh, camera in map(mesh_and_camera, views)]
 
     def ahead(self, points: np.ndarray) -> np.ndarray:
-        """How far points (n, 3) lie in front of what a view saw behind them, metres; the largest over all views.
+        """Compute the largest free-space violation over all views: how far points (n, 3) are in front of the surface,
+        metres.
 
         Negative behind the surface of every view, -inf where no line of sight through the point ends on a surface.
         """

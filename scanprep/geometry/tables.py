@@ -1,4 +1,4 @@
-"""Tables as spreadsheets save them."""
+"""Read and write CSV tables, as spreadsheets save them."""
 from __future__ import annotations
 
 import contextlib
@@ -16,10 +16,10 @@ from .storage import LARGEST_TEXT, UTF_16, StorageError, read_bytes, taking_apar
 
 def read_table(path: str | Path, columns: Sequence[str], needed: Sequence[str] | None = None
                ) -> list[tuple[int, dict[str, str]]]:
-    """Lines and cells, by column, of a CSV table with a heading, as spreadsheets save it: see `table_rows`.
+    """Read a CSV table with a heading: line numbers, and cells by column; see `table_rows`.
 
-    Every one of `columns` is there, empty where the table does not have it, and other columns too. StorageError unless
-    the table has the `needed` ones of them, or all, each once, and lines that are equally long.
+    Missing `columns` are empty; other columns are returned too. StorageError unless the table has the `needed` columns,
+    by default all, each once, and rows of equal length.
     """
     _, rows = table_rows(path, read_bytes(path, f"a table with the columns {','.join(columns)}"))
     head = rows[0][1] if rows else []
@@ -32,12 +32,12 @@ def read_table(path: str | Path, columns: Sequence[str], needed: Sequence[str] |
     return [(line, {**dict.fromkeys(columns, ""), **dict(zip(head, cells, strict=True))}) for line, cells in rows[1:]]
 
 
-# What spreadsheets take for a formula, and run: with an apostrophe in front it is text to them.
+# spreadsheets run this as a formula; with an apostrophe in front it is text
 _FORMULA = re.compile(r"'*[=+\-@]")
 
 
 def _as_cell(value: Any) -> Any:
-    """A value as the cell of a table: text that begins as a formula does gets an apostrophe in front."""
+    """Convert a value to a cell; text that begins like a formula gets an apostrophe in front."""
     if not isinstance(value, str) or not _FORMULA.match(value):
         return value
     with contextlib.suppress(ValueError):
@@ -47,12 +47,12 @@ def _as_cell(value: Any) -> Any:
 
 
 def _of_cell(cell: str) -> str:
-    """What `_as_cell` was given."""
+    """Undo `_as_cell`."""
     return cell[1:] if cell.startswith("'") and _FORMULA.match(cell) else cell
 
 
 def write_table(path: str | Path, header: Sequence[str], rows: Iterable[Sequence[Any]]) -> None:
-    """Write a CSV table, whole or not at all; `read_table` gives back the same text."""
+    """Write a CSV table, atomically; `read_table` gives back the same text."""
     text = io.StringIO()
     table = csv.writer(text, lineterminator="\n")
     table.writerow(header)
@@ -61,13 +61,13 @@ def write_table(path: str | Path, header: Sequence[str], rows: Iterable[Sequence
 
 
 def number_lines(rows: np.ndarray, number: str = "%.6g", separator: str = ",") -> list[str]:
-    """A line of text for each row (K,) of numbers, all printed as `number` says; nothing where one is NaN."""
+    """Format each row (K,) of numbers as a line, with the format `number`; NaN becomes an empty cell."""
     line = separator.join([number] * rows.shape[1])
     return [(line % tuple(row.tolist())).replace("nan", "") for row in rows]
 
 
 def number_table(header: Sequence[str], rows: np.ndarray, number: str = "%.6g") -> str:
-    """A CSV table of numbers (T, K), K at least 2: `number_lines` below a heading."""
+    """Format a CSV table of numbers (T, K), K at least 2: a heading and `number_lines`."""
     text = io.StringIO()
     csv.writer(text, lineterminator="\n").writerow(map(_as_cell, header))
     return "\n".join([text.getvalue()[:-1], *number_lines(rows, number), ""])
@@ -75,11 +75,10 @@ def number_table(header: Sequence[str], rows: np.ndarray, number: str = "%.6g") 
 
 def table_rows(path: str | Path, data: bytes, error: type[StorageError] = StorageError, separators: str = ",;\t"
                ) -> tuple[str, list[tuple[int, list[str]]]]:
-    """The separator of a CSV table, and the number and cells of each line that is not empty.
+    """Split a CSV table: its separator, and number and cells of each non-empty line.
 
-    UTF-8 with or without a mark, UTF-16 with one, or the Windows alphabet of western Europe. The separator is the one
-    of `separators` that comes most often in the first line, the earlier one of two. Empty cells beyond the end of the
-    first line are left out.
+    Encodings: UTF-8 with or without byte order mark, UTF-16 with one, or Windows-1252. The separator is the most
+    frequent of `separators` in the first line. Empty cells beyond the width of the first line are dropped.
     """
     with taking_apart(path, "a CSV table", error):
         text = decode_text(data)
@@ -94,13 +93,13 @@ def table_rows(path: str | Path, data: bytes, error: type[StorageError] = Storag
     return separator, [(line, cells) for line, cells in rows if any(cells)]
 
 
-# How programs print a number that there is none of, in small letters.
+# how programs print a missing number, in lower case
 _NONE = {"", "nan", "-nan", "nan(ind)", "-nan(ind)", "nan(snan)", "-nan(snan)", "1.#qnan", "-1.#qnan", "1.#ind",
          "-1.#ind", "1.#snan", "null", "none", "na", "n/a", "-", "--", "#n/a"}
 
 
 def number_cells(cells: Sequence[str], decimal_commas: bool = False) -> list[float]:
-    """The numbers of some cells, NaN for an empty one and for what programs print there; ValueError for other text."""
+    """Convert cells to numbers, NaN for empty cells and missing values; ValueError for other text."""
     out = []
     for cell in cells:
         try:
@@ -112,7 +111,7 @@ def number_cells(cells: Sequence[str], decimal_commas: bool = False) -> list[flo
 
 
 def decode_text(data: bytes) -> str:
-    """Text of a file as programs save it, without a mark of its encoding; ValueError for what is none, or too long."""
+    """Decode the text of a file, without byte order mark; ValueError if it is no text, or too long."""
     if len(data) > LARGEST_TEXT:
         raise ValueError(f"{len(data)} bytes, more than {LARGEST_TEXT}")
     if data[:2] in UTF_16:

@@ -1,4 +1,4 @@
-"""A scan as a target of registration: its points with smooth normals, and which of them end at a hole."""
+"""A scan prepared as a target: points with smooth normals, and which of them are on a border."""
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
@@ -21,13 +21,13 @@ class Target:
 
     points: np.ndarray                          # (n, 3), metres
     normals: np.ndarray                         # (n, 3)
-    border: np.ndarray                          # (n,) bool: on the edge of a hole, where data end, not the surface
+    border: np.ndarray                          # (n,) bool: on the edge of a hole, where the data end
     oriented: bool                              # the normals are known to point outward
-    descriptors: np.ndarray | None = None       # (n, q) what else a point is matched by (see `path_descriptors`)
+    descriptors: np.ndarray | None = None       # (n, q) path descriptors, see `registration.paths`
     index: np.ndarray | None = None             # (n,) number of each point in the scan
 
     def thin(self, cell: float) -> Target:
-        """One point for each cubic cell (metres)."""
+        """Return the target with one point per cubic cell (metres)."""
         keep = thin(self.points, cell)
         return Target(self.points[keep], self.normals[keep], self.border[keep], self.oriented,
                       None if self.descriptors is None else self.descriptors[keep],
@@ -35,7 +35,7 @@ class Target:
 
 
 def target_of(scan: Mesh | np.ndarray, name: str = "scan") -> Target:
-    """Prepare a scan: repeated points left out, normals averaged over neighbours, borders found.
+    """Prepare a scan: drop repeated points, average normals over neighbours, and find borders.
 
     Every point has a normal. ValueError for fewer than four distinct points.
     """
@@ -49,7 +49,7 @@ def target_of(scan: Mesh | np.ndarray, name: str = "scan") -> Target:
     if len(index) < 4:
         raise ValueError(f"{name}: expected at least 4 distinct points, got {len(index)}")
     points = points[index]
-    # points of a scan over which its normals are averaged
+    # normals are averaged over 16 points, about two rings
     near = cKDTree(points).query(points, min(16, len(points)), workers=search_threads(len(points)))[1]
     if normals is not None:
         return Target(points, _average_normals(points, normals, near), _one_sided(points, near), True, index=index)
@@ -57,14 +57,14 @@ def target_of(scan: Mesh | np.ndarray, name: str = "scan") -> Target:
 
 
 def _average_normals(points: np.ndarray, normals: np.ndarray, near: np.ndarray) -> np.ndarray:
-    """Unit normals (n, 3), each the mean over the neighbours (n, k) that face the same way.
+    """Average unit normals (n, 3) over the neighbours (n, k) that face the same way.
 
-    Where the triangles around a point cancel, as where they lie back to back, it is that of its neighbours' plane.
+    Where the triangles around a point cancel, for example back to back, the plane of its neighbours is used.
     """
     agree = np.einsum("nkd,nd->nk", normals[near], normals) > 0
     mean = np.einsum("nk,nkd->nd", agree, normals[near])
     length = np.linalg.norm(mean, axis=1)
-    lost = length < 1e-9                     # all others sum up at least one unit normal
+    lost = length < 1e-9                     # otherwise at least its own unit normal is in the sum
     if lost.any():
         plane = _spread_normals(points[near[lost]])
         against = np.einsum("nd,nd->n", plane, normals[near[lost]].sum(axis=1)) < 0
@@ -74,21 +74,20 @@ def _average_normals(points: np.ndarray, normals: np.ndarray, near: np.ndarray) 
 
 
 def _spread_normals(near: np.ndarray) -> np.ndarray:
-    """Unit normals (n, 3) by the spread of each point's neighbours (n, k, 3); their sign is arbitrary."""
+    """Estimate unit normals (n, 3) by the least spread of each point's neighbours (n, k, 3); signs are arbitrary."""
     offset = near - near.mean(axis=1, keepdims=True)
     return np.linalg.eigh(np.matmul(offset.transpose(0, 2, 1), offset))[1][:, :, 0]
 
 
 def _one_sided(points: np.ndarray, near: np.ndarray) -> np.ndarray:
-    """(n,) bool: the neighbours lie to one side, as at the edge of a hole; single missing points do not count."""
+    """Find border points (n,) bool: their neighbours lie to one side. Single missing points do not make a border."""
     offset = points[near] - points[:, None]
     reach = np.linalg.norm(offset, axis=2).max(axis=1)
     return np.linalg.norm(offset.mean(axis=1), axis=1) > 0.3 * reach
 
 
 def orient_by_mesh(target: Target, deformed: Mesh, scale: float) -> Target:
-    """The same target with the sign of its normals from the nearest part of a mesh on it; `scale` as `OrientedPoints`.
-    """
+    """Orient the normals of a target by the nearest part of a mesh on it; `scale` as for `OrientedPoints`."""
     if target.oriented:
         return target
     tree = OrientedPoints(deformed.vertices, deformed.vertex_normals, scale)

@@ -1,4 +1,4 @@
-"""Scans that are finer than any work needs, thinned before it, so that it ends within minutes and gigabytes."""
+"""Thin very fine scans first, so that later stages need only minutes and gigabytes."""
 from __future__ import annotations
 
 import warnings
@@ -10,29 +10,33 @@ from .mesh import Mesh
 from .places import distinct_rows
 from .sparse import label_components
 
-MOST = 1_000_000         # triangles of a person about 1.8 mm long; what has less than twice as many is left as it is
+MOST = 1_000_000         # triangles: 1.8 mm edges on a person; up to twice as many are kept
 
 
 def thin_scan(scan: Mesh, name: str = "scan", most: int = MOST) -> Mesh:
-    """A scan with at most about `most` triangles, with a UserWarning, where it had more than twice as many.
+    """Thin a scan with more than twice `most` triangles to about `most`, with a UserWarning.
 
-    The vertices in each cell of a grid become one, their mean. `of_file` says which one each of the file has become, so
-    files of vertex numbers go on to mean the same places. A manifold surface stays one, unless that takes more
-    triangles than `most`.
+    The vertices in each grid cell are merged into their mean. `of_file` maps the vertex numbers of the file, so files
+    with vertex numbers stay valid. A manifold surface stays manifold, unless that needs more than `most` triangles.
 
     Parameters
     ----------
     scan : Mesh
-        In any unit; the very same comes back where it is not larger.
+        In any unit; the same object is returned if it is not larger.
     name : str
-        What the warning calls it: its file, or the argument.
+        Name of the scan in the warning: its file, or the argument.
     most : int
+        Number of triangles to reach.
+
+    Returns
+    -------
+    Mesh
     """
     if len(scan.faces) <= 2 * most:
         return scan
-    # A grid cuts a surface in about 3/2 as many cells as its area has squares; there is a vertex to two triangles.
-    some = scan.faces[:: max(1, len(scan.faces) // 100_000)]
-    a, b, c = np.moveaxis(scan.vertices[some], 1, 0)
+    # cell size: a surface of area A meets about 3/2 A / cell² cells, and has two triangles per vertex
+    sample = scan.faces[:: max(1, len(scan.faces) // 100_000)]
+    a, b, c = np.moveaxis(scan.vertices[sample], 1, 0)
     area = 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1).mean() * len(scan.faces)
     cell = float(np.sqrt(3 * area / most))
     low = scan.vertices.min(axis=0)
@@ -44,7 +48,7 @@ def thin_scan(scan: Mesh, name: str = "scan", most: int = MOST) -> Mesh:
     size = np.bincount(new)
     points = low + _means(scan.vertices - low, new, size)
     colors = None if scan.colors is None else _means(scan.colors, new, size)
-    # Of a pleat nothing is left: its vertices become the nearest that are.
+    # vertices of folds that vanished become the nearest remaining ones
     used, numbered = np.unique(faces, return_inverse=True)
     row = np.full(len(size), -1)
     row[used] = np.arange(len(used))
@@ -57,12 +61,12 @@ def thin_scan(scan: Mesh, name: str = "scan", most: int = MOST) -> Mesh:
 
 
 def _cut_up(new: np.ndarray, scan: Mesh, most: int) -> tuple[np.ndarray, np.ndarray]:
-    """The new vertex of each vertex (N,), and the triangles (F, 3) of the new ones.
+    """Return the new vertex of each vertex (N,), and the new triangles (F, 3), split where they are not manifold.
 
-    Where they would make no manifold surface, two sheets share a cell, or one that is folded. There the cells are cut
-    into the pieces that the edges inside of them join, and where that is not enough into the vertices of the scan.
+    There two sheets, or a folded one, share a cell. Such cells are split into the pieces connected by edges inside, and
+    if that is not enough into the vertices of the scan.
     """
-    asked = np.ones(new.max() + 1, dtype=bool)              # new vertices that may be bad: all, then those beside cuts
+    asked = np.ones(new.max() + 1, dtype=bool)              # new vertices to check: all, then those beside splits
     first = True
     while True:
         corners = new[scan.faces]
@@ -72,19 +76,19 @@ def _cut_up(new: np.ndarray, scan: Mesh, most: int) -> tuple[np.ndarray, np.ndar
         bad = np.zeros(len(asked), dtype=bool)
         bad[near.non_manifold_vertices] = True
         bad &= asked & (np.bincount(new) > 1)
-        if not bad.any() or len(faces) > most:              # cuts end: vertices of the scan cannot be cut
+        if not bad.any() or len(faces) > most:              # ends, as single vertices cannot be split
             return new, faces
         members = np.flatnonzero(bad[new])
         piece = _join(new, members, scan.faces) if first else np.arange(len(members))
         touched = np.unique(corners[bad[corners].any(axis=1)])
-        old = np.r_[np.flatnonzero(~bad), np.full(piece.max() + 1, -1)]     # numbers before, of what is left, then cut
+        old = np.r_[np.flatnonzero(~bad), np.full(piece.max() + 1, -1)]     # previous numbers; -1 for split ones
         new[members] = len(bad) + piece
         new = np.unique(new, return_inverse=True)[1].reshape(-1)
         asked, first = (old < 0) | np.isin(old, touched), False
 
 
 def _join(new: np.ndarray, members: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """(M,) the piece of each of the vertices `members` (M,): edges join those that have become the same one."""
+    """Label pieces (M,) of the vertices `members` (M,): edges join those with the same new vertex."""
     row = np.full(len(new), -1)
     row[members] = np.arange(len(members))
     a, b = faces.ravel(), np.roll(faces, -1, axis=1).ravel()
@@ -93,9 +97,9 @@ def _join(new: np.ndarray, members: np.ndarray, faces: np.ndarray) -> np.ndarray
 
 
 def _without_pleats(faces: np.ndarray) -> np.ndarray:
-    """Triangles (F, 3) once each, the way that most of the equal ones face; none of an even number.
+    """Keep equal triangles (F, 3) once, with the orientation of most; none if they cancel in pairs.
 
-    Noise lays a surface in pleats. What is dropped has no border of its own, so no hole opens.
+    Noise folds a fine surface. Dropped pairs have no border of their own, so no hole opens.
     """
     group = distinct_rows(np.sort(faces, axis=1))
     if group is None:
@@ -108,5 +112,5 @@ def _without_pleats(faces: np.ndarray) -> np.ndarray:
 
 
 def _means(values: np.ndarray, group: np.ndarray, size: np.ndarray) -> np.ndarray:
-    """(n, 3) the mean of the values (N, 3) of each group, (N,) int."""
+    """Average values (N, 3) over groups (N,) int into (n, 3)."""
     return np.stack([np.bincount(group, column) / size for column in values.T], axis=1)

@@ -1,4 +1,4 @@
-"""Where a picture is taken from, also of a body whose axes nobody has named."""
+"""Cameras of pictures, also for bodies whose up and front are not known."""
 from __future__ import annotations
 
 from collections.abc import Sequence
@@ -15,21 +15,36 @@ from ..geometry.mesh import Mesh
 class Camera:
     """A view of the scene; the picture is scaled so that `width` × `height` metres fit into it."""
 
-    target: np.ndarray  # (3,) float, metres: what stands in the middle of the picture
+    target: np.ndarray  # (3,) float, metres: point in the middle of the picture
     axes: np.ndarray  # (3, 3) float: rows: right, up and back (towards the camera), unit and perpendicular
     vertical: np.ndarray  # (3,) float: unit vector that points away from the ground
-    width: float  # metres: extent to be visible at the target
-    height: float  # metres: extent to be visible at the target
+    width: float  # metres: visible extent at the target
+    height: float  # metres: visible extent at the target
     distance: float = np.inf  # metres: from the camera to the target; inf for parallel rays
 
     @classmethod
     def around(cls, subject: Any, azimuth: float = 0.0, elevation: float = 8.0,
                up: int = 2, lens: float = 6.0, margin: float = 1.06) -> Camera:
-        """A camera that holds the whole subject: meshes, solids, or points (n, 3), two of them corners of a box.
+        """Make a camera that sees the whole subject: meshes, solids, or points (n, 3); two points are corners of a box.
 
-        `azimuth`, degrees, runs counter-clockwise about the axis `up` (0, 1 or 2) from the +x side when z is up, from
-        the +z side when y is up; `elevation`, degrees. `lens` is the distance of the camera in sizes of the subject
-        (inf for parallel rays), `margin` the extent of the picture over that of the subject.
+        Parameters
+        ----------
+        subject : Mesh, Solid, (n, 3) float in metres, or sequence of these
+            What has to fit into the picture.
+        azimuth : float, degrees
+            Counter-clockwise about the axis `up`: from the +x side when z is up, from the +z side when y is up.
+        elevation : float, degrees
+            Height of the camera above the horizontal.
+        up : 0, 1 or 2
+            Axis that points up.
+        lens : float
+            Distance of the camera in sizes of the subject; inf for parallel rays.
+        margin : float
+            Extent of the picture over that of the subject.
+
+        Returns
+        -------
+        Camera
         """
         a = np.radians(azimuth)
         vertical, first, second = np.eye(3)[[up, (up + 1) % 3, (up + 2) % 3]]
@@ -38,15 +53,17 @@ class Camera:
     @classmethod
     def from_side(cls, subject: Any, side: np.ndarray, vertical: np.ndarray, elevation: float = 8.0, lens: float = 6.0,
                   margin: float = 1.06) -> Camera:
-        """As `around`, seen from where a direction `side` (3,) points, with the unit vector `vertical` (3,) up."""
+        """Make a camera as `around`, seen from the direction `side` (3,), with the unit vector `vertical` (3,) up."""
         points, e = _points(subject), np.radians(elevation)
         middle = (points.min(axis=0) + points.max(axis=0)) / 2
         flat = side - (side @ vertical) * vertical
         flat = flat / np.linalg.norm(flat)
+        # axes of the camera: the side without its vertical part, raised by the elevation
         back, right = np.cos(e) * flat + np.sin(e) * vertical, np.cross(vertical, flat)
         axes = np.stack([right, np.cross(back, right), back])
         size = max(float(np.linalg.norm(points.max(axis=0) - points.min(axis=0))), 1e-9)
         x, y, depth = ((points - middle) @ axes.T).T
+        # perspective enlarges what is nearer; then centre the picture on what is visible
         if np.isfinite(lens):
             nearer = lens * size / (lens * size - depth)
             x, y = x * nearer, y * nearer
@@ -56,15 +73,16 @@ class Camera:
 
     @property
     def position(self) -> np.ndarray:
-        """(3,) float, metres; of a camera with parallel rays, a point far behind the scene."""
+        """(3,) float, metres: where the camera is; for parallel rays, a point far outside the scene."""
         away = self.distance if np.isfinite(self.distance) else 10 * (self.width + self.height)
         return self.target + away * self.axes[2]
 
     def rays(self, width: int, height: int, samples: int = 1) -> tuple[np.ndarray, np.ndarray]:
-        """Origins, relative to the target, and unit directions of the rays of a picture, row by row.
+        """Compute origins, relative to the target, and unit directions of the rays of a picture, row by row.
 
         Both are (height·samples · width·samples, 3) float32.
         """
+        # points on the plane through the target, one per sample
         pixel = max(self.width / width, self.height / height) / samples
         across = (np.arange(width * samples) + 0.5 - width * samples / 2) * pixel
         down = (height * samples / 2 - np.arange(height * samples) - 0.5) * pixel
@@ -72,6 +90,7 @@ class Camera:
         on_plane = (down.astype(np.float32)[:, None, None] * up + across.astype(np.float32)[:, None] * right)
         on_plane = on_plane.reshape(-1, 3)
         if not np.isfinite(self.distance):
+            # parallel rays begin far outside the scene
             far = np.float32(10 * (self.width + self.height))
             origins = on_plane + far * back
             return origins, np.broadcast_to(-back, origins.shape)
@@ -80,7 +99,7 @@ class Camera:
         return np.broadcast_to(np.float32(self.distance) * back, directions.shape), directions
 
     def project(self, points: np.ndarray, width: int, height: int) -> np.ndarray:
-        """Where points (n, 3) appear in a picture: (n, 2) column and row in pixels."""
+        """Project points (n, 3) into a picture: (n, 2) column and row in pixels."""
         x, y, depth = ((np.asarray(points) - self.target) @ self.axes.T).T
         nearer = self.distance / (self.distance - depth) if np.isfinite(self.distance) else 1.0
         pixel = max(self.width / width, self.height / height)
@@ -88,6 +107,7 @@ class Camera:
 
 
 def _points(subject: Any) -> np.ndarray:
+    """Return the points (n, 3) of a subject, finite ones only; two points become the corners of their box."""
     subject = getattr(subject, "mesh", subject)
     if isinstance(subject, Mesh):
         return subject.vertices
@@ -104,21 +124,23 @@ def _points(subject: Any) -> np.ndarray:
 
 
 def guess_upright(mesh: Mesh) -> tuple[int, float]:
-    """The axis that is probably up and the azimuth, degrees, of a camera that probably sees the front; for pictures.
+    """Guess the axis that is up, and the azimuth, degrees, of a camera that sees the front; for pictures only.
 
-    Up is the axis of the largest extent, but for arms that are spread wider (`tallest`). The front is where the toes
-    point: on either side, from what lies within a tenth of the height to the lowest twentieth; of 71 poses of a man it
-    is off by more than 60 degrees in 8. Without feet it is the side from which the body is widest.
+    Up is the axis of the largest extent, unless arms are spread wider (`tallest`). The front is where the toes point.
+    On each side that is the direction from what lies within a tenth of the height to the lowest twentieth. Of 71 poses
+    of a man it is off by more than 60 degrees in 8. Without feet it is the side from which the body is widest.
     """
     extent = np.ptp(mesh.vertices, axis=0)
     up = tallest(mesh.vertices)
-    if extent[up] == 0:                                                     # a point has no front
+    if extent[up] == 0:                                                     # a single point has no front
         return up, 0.0
     height = (mesh.vertices[:, up] - mesh.vertices[:, up].min()) / extent[up]
     flat = mesh.vertices[:, [(up + 1) % 3, (up + 2) % 3]]
+    # the horizontal direction in which the body is thinnest; its sign is arbitrary
     weights = mesh.vertex_areas if len(mesh.faces) and mesh.face_areas.any() else np.ones(len(flat))
     _, directions = np.linalg.eigh(np.cov(flat.T, aweights=weights))
     forward, across = directions[:, 0], flat @ directions[:, 1]
+    # feet point ahead: use them where they are clearly there
     low = height < 0.1
     left = across > np.average(across[low], weights=weights[low])
     toes = sum((_toes(flat[side], height[side], weights[side]) for side in (left, ~left)), np.zeros(2))
@@ -128,7 +150,7 @@ def guess_upright(mesh: Mesh) -> tuple[int, float]:
 
 
 def _toes(flat: np.ndarray, height: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    """From the ankle to the toes (2,), metres, of one foot; zero where there is none."""
+    """Compute the vector from ankle to toes (2,), metres, of one foot; zero where there is none."""
     sole, ankle = height < 0.05, (height >= 0.05) & (height < 0.1)
     if not (sole.any() and ankle.any()):
         return np.zeros(2)
@@ -138,11 +160,24 @@ def _toes(flat: np.ndarray, height: np.ndarray, weights: np.ndarray) -> np.ndarr
 
 def look_around(body: Mesh, poses: np.ndarray | None = None, turns: Sequence[float] = (0, 90, 180, 270),
                 turned: np.ndarray | None = None, vertical: np.ndarray | None = None) -> list[Camera]:
-    """Cameras around a standing body: by default from its front, its left, its back and its right.
+    """Make cameras around a standing body: by default from its front, left, back and right.
 
-    `turns` are degrees from the front; `poses` (..., 3), metres, is what has to fit into the picture if not the body.
-    `turned` (..., 3, 3) are the rotations of its root there, `vertical` (3,) what is up if they do not tell: see
-    `stance`.
+    Parameters
+    ----------
+    body : Mesh
+        The body at rest.
+    poses : (..., 3) float, metres, optional
+        Points that have to fit into the picture, if not the body's.
+    turns : sequence of float, degrees
+        Directions of the cameras from the front.
+    turned : (..., 3, 3) float, optional
+        Rotations of the body's root in the poses.
+    vertical : (3,) float, optional
+        What is up, where the rotations do not say: see `stance`.
+
+    Returns
+    -------
+    list of Camera
     """
     vertical, ahead = stance(body, turned, vertical)
     subject = body.vertices if poses is None else np.asarray(poses, dtype=float).reshape(-1, 3)
@@ -152,10 +187,10 @@ def look_around(body: Mesh, poses: np.ndarray | None = None, turns: Sequence[flo
 
 def stance(body: Mesh, turned: np.ndarray | None = None, vertical: np.ndarray | None = None
            ) -> tuple[np.ndarray, np.ndarray]:
-    """Up, along an axis, and ahead of a standing body, unit vectors (3,); `turned` (..., 3, 3) are turns of its root.
+    """Find up, along an axis, and ahead of a standing body, as unit vectors (3,).
 
-    Up is the body's own axis unless the turns, on average, lay it over: then it is the axis nearest to its head. One
-    frame of a motion is told what is `vertical` in all of it.
+    `turned` (..., 3, 3) are rotations of its root. Up is the body's own axis unless these rotations, on average, lay it
+    down: then it is the axis nearest to its head. For a single frame pass the `vertical` of the whole motion.
     """
     up, front = guess_upright(body)
     own, first, second = np.eye(3)[[up, (up + 1) % 3, (up + 2) % 3]]
@@ -165,8 +200,9 @@ def stance(body: Mesh, turned: np.ndarray | None = None, vertical: np.ndarray | 
     if vertical is None:
         now = mean @ own
         nearest = np.sign(now[np.abs(now).argmax()]) * np.eye(3)[np.abs(now).argmax()]
-        # cosine: a body that leans no further is not laid over
+        # cosine of 53 degrees: a body that leans less is still upright
         vertical = own if now @ own > 0.6 else nearest
+    # ahead: the mean front, else that of the first frame, else where the head points; horizontal part only
     ways = [way - (way @ vertical) * vertical for way in (mean @ ahead, turned[0] @ ahead, turned[0] @ own)]
-    ahead = next(way for way in ways if np.linalg.norm(way) > 0.1)     # the mean of a turn on the spot says nothing
+    ahead = next(way for way in ways if np.linalg.norm(way) > 0.1)     # a full turn averages to nothing
     return vertical, ahead / np.linalg.norm(ahead)

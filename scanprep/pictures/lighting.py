@@ -1,4 +1,4 @@
-"""What light does to triangles under a camera: rays, visibility, shading, and the canvas it ends on."""
+"""Light on triangles under a camera: ray casting, visibility, shading, and the canvas that collects the result."""
 from __future__ import annotations
 
 from collections.abc import Sequence
@@ -10,17 +10,19 @@ from scipy.ndimage import gaussian_filter, map_coordinates
 from ..geometry.format_common import as_seen
 from ..geometry.sparse import unique_integers
 
-# Directions of the lights in the camera's frame (right, up, back) and their linear strengths.
+# Three-point lighting: directions in the camera's frame (right, up, back) and linear strengths. The key light models
+# the form, the fill softens its shadows, the rim light from behind separates the body from the background.
 KEY, FILL, RIM = ((-0.58, 0.62, 0.52), 1.00), ((0.85, 0.05, 0.50), 0.13), ((0.62, 0.40, -0.68), 0.50)
+# linear ambient light from above, bluish, and from the ground, warmer and darker
 SKY, BOUNCE = np.array([0.32, 0.34, 0.38]), np.array([0.20, 0.175, 0.16])
 
 
 @dataclass(frozen=True, eq=False)
 class LitTriangles:
-    """Corners (F, 3, 3) with their unit normals and linear colours, both (F, 3, 3).
+    """Triangles to be lit: corners (F, 3, 3) with unit normals and linear colours, both (F, 3, 3).
 
-    Shapes whose visibility is to be computed also bring the vertex numbers (F, 3) of the corners and the normals
-    (N, 3) at the vertices.
+    Shapes that receive shadows also have the vertex numbers (F, 3) of the corners, and the normals (N, 3) of the
+    vertices.
     """
 
     corners: np.ndarray
@@ -32,7 +34,7 @@ class LitTriangles:
 
 @dataclass(frozen=True, eq=False)
 class Seen:
-    """What rays hit: the numbers of the rays (n,), linear colours (n, 3), cosine of the slant (n,), depth (n,)."""
+    """What rays hit: numbers of the rays (n,), linear colours (n, 3), cosine to the normal (n,), depth (n,)."""
 
     rays: np.ndarray
     colors: np.ndarray
@@ -41,7 +43,7 @@ class Seen:
 
 
 class Scene:
-    """Triangles in one search tree, with the camera's frame `axes` (3, 3) and the direction off the ground."""
+    """Triangles in one search tree, with the camera's frame `axes` (3, 3) and the direction away from the ground."""
 
     def __init__(self, shapes: Sequence[LitTriangles], axes: np.ndarray, vertical: np.ndarray) -> None:
         from embreex.mesh_construction import TriangleMesh
@@ -53,7 +55,7 @@ class Scene:
         self.outward = np.cross(c[:, 1] - c[:, 0], c[:, 2] - c[:, 0])
         self._shapes = shapes
         self._starts = np.cumsum([0] + [len(s.corners) for s in shapes])
-        # normal, colour, ambient and key visibility of every corner, interpolated together
+        # of every corner: normal (3), colour (3), visibility of the sky and of the key light; interpolated together
         self.attributes = np.ones((len(self.corners), 3, 8), dtype=np.float32)
         self.attributes[..., :3] = np.concatenate([s.normals for s in shapes])
         self.attributes[..., 3:6] = np.concatenate([s.colors for s in shapes])
@@ -61,40 +63,45 @@ class Scene:
         self._kept = TriangleMesh(self._tree, *_merge_shapes(shapes))
         span = self.corners.reshape(-1, 3)
         self.size = float(np.linalg.norm(np.ptp(span, axis=0))) if len(span) else 1.0
+        # the floor is at the lowest point of the solid shapes
         solids = [s.corners.reshape(-1, 3) @ vertical for s in shapes if s.faces is not None and len(s.corners)]
         self.floor = min((float(h.min()) for h in solids), default=np.inf)
 
     def cast(self, origins: np.ndarray, directions: np.ndarray) -> Seen:
-        """What rays hit."""
+        """Cast rays, and shade what they hit."""
         if not len(self.corners):
             return Seen(np.empty(0, int), np.empty((0, 3), np.float32), *np.empty((2, 0), np.float32))
         hit = self._tree.run(np.ascontiguousarray(origins), np.ascontiguousarray(directions), output=True)
         rays = np.flatnonzero(hit["primID"] >= 0)
         face = hit["primID"][rays]
-        # fill in the visibility at the corners of the triangles in sight
+        # compute the visibility at the corners of the triangles in sight only
         faces = unique_integers(face)
-        # from each vertex in sight; 80 look the same, and take 1.7 times as long
+        # 48 directions from each vertex: 80 look the same, and take 1.7 times as long
         sky = sphere_directions(48)
+        # a light of 0.16 radians gives soft shadows
         key = cone_directions(_unit(np.array(KEY[0])) @ self.axes, 0.16, 14)
         for shape, start, end in zip(self._shapes, self._starts[:-1], self._starts[1:], strict=True):
-            mine = faces[(faces >= start) & (faces < end)] - start
-            if shape.faces is None or shape.vertex_normals is None or not len(mine):
+            own_faces = faces[(faces >= start) & (faces < end)] - start
+            if shape.faces is None or shape.vertex_normals is None or not len(own_faces):
                 continue
-            vertices, first = np.unique(shape.faces[mine], return_index=True)
-            points = shape.corners[mine].reshape(-1, 3)[first]
+            vertices, first = np.unique(shape.faces[own_faces], return_index=True)
+            points = shape.corners[own_faces].reshape(-1, 3)[first]
             normals = shape.vertex_normals[vertices]
             light = np.ones((len(shape.vertex_normals), 2), dtype=np.float32)
+            # ambient occlusion looks as far as a third of the scene, shadows reach through all of it
             light[vertices, 0] = self._open(points, normals, sky, 0.30 * self.size)
             light[vertices, 1] = self._open(points, normals, key, 4 * self.size)
-            self.attributes[start + mine, :, 6:] = light[shape.faces[mine]]
+            self.attributes[start + own_faces, :, 6:] = light[shape.faces[own_faces]]
+        # interpolate at the place that each ray hits
         u, v = hit["u"][rays], hit["v"][rays]
         bary = np.stack([1 - u - v, u, v], axis=1)
         return Seen(rays, *self._shade(face, bary, directions[rays]), hit["tfar"][rays])
 
     def _open(self, points: np.ndarray, normals: np.ndarray, directions: np.ndarray, reach: float) -> np.ndarray:
-        """Cosine-weighted share of directions (k, 3) in which points (n, 3) look into the open."""
+        """Compute the cosine-weighted share of directions (k, 3) in which points (n, 3) see no obstacle."""
         cosine = np.maximum(normals @ directions.T, 0)
         point, direction = np.nonzero(cosine > 0.05)
+        # start a little off the surface, so that a ray does not hit its own triangle
         start = (points + 2e-3 * self.size * normals).astype(np.float32)[point]
         along = directions.astype(np.float32)[direction]
         far = np.full(len(point), reach, dtype=np.float32)
@@ -106,18 +113,21 @@ class Scene:
 
     def _shade(self, face: np.ndarray, bary: np.ndarray, directions: np.ndarray
                ) -> tuple[np.ndarray, np.ndarray]:
-        """Linear colour (n, 3) of points on triangles seen along directions, and the cosine of their slant."""
-        found = np.einsum("nc,ncd->nd", bary, self.attributes[face])
-        normal, color, ambient, key_light = found[:, :3], found[:, 3:6], found[:, 6, None], found[:, 7, None]
+        """Compute the linear colour (n, 3) of points on triangles, and the cosine between ray and normal."""
+        at = np.einsum("nc,ncd->nd", bary, self.attributes[face])
+        normal, color, ambient, key_light = at[:, :3], at[:, 3:6], at[:, 6, None], at[:, 7, None]
         inner = np.einsum("nd,nd->n", self.outward[face], directions) > 0
+        # seen from inside, the normal is turned towards the camera
         normal = _unit(normal) * np.where(inner, -1, 1)[:, None].astype(np.float32)
-        # tint of the inner side of an open surface
+        # the inner side of an open surface is dark and bluish
         color = np.where(inner[:, None], color * np.array([0.30, 0.33, 0.40]).astype(np.float32), color)
+        # diffuse light of the three lamps, and of the sky above and the ground below
         lights = [(_unit(np.array(d)) @ self.axes).astype(np.float32) for d, _ in (KEY, FILL, RIM)]
         key, fill, rim = (np.maximum(normal @ d, 0)[:, None] for d in lights)
         upward = 0.5 + 0.5 * (normal @ self.vertical.astype(np.float32))[:, None]
         sky = (upward * SKY + (1 - upward) * BOUNCE).astype(np.float32)
         facing = np.clip(-np.einsum("nd,nd->n", normal, directions), 0, 1)[:, None]
+        # Blinn-Phong highlight of the key light, and a brighter edge at grazing angles
         half = _unit(lights[0] - directions)
         gloss = np.maximum(np.einsum("nd,nd->n", normal, half), 0)[:, None] ** 24
         ambient = ambient ** 1.2
@@ -126,64 +136,71 @@ class Scene:
         return color * diffuse + np.where(inner[:, None], 0, sheen), facing[:, 0]
 
     def ground_shadow(self, origins: np.ndarray, directions: np.ndarray, cells: int = 64) -> np.ndarray:
-        """Alpha of the shadow on the floor along each ray."""
+        """Compute the opacity of the shadow on the floor along each ray."""
+        # a grid on the floor, wider than the body by a third of its height
         across = np.stack([self.axes[0], np.cross(self.vertical, self.axes[0])], axis=1)
         points = self.corners.reshape(-1, 3)
         tall = 0.30 * float(np.ptp(points @ self.vertical))
         low, high = (points @ across).min(axis=0) - tall, (points @ across).max(axis=0) + tall
         s, t = np.meshgrid(*(np.linspace(low[i], high[i], cells) for i in range(2)), indexing="ij")
         dark = self._floor_darkness(np.stack([s.ravel(), t.ravel()], axis=1) @ across.T).reshape(cells, cells)
+        # blur the grid, and fade it out towards its edge
         fade = np.clip(np.minimum(np.arange(cells), np.arange(cells)[::-1]) / (0.2 * cells), 0, 1)
         dark = (0.46 * gaussian_filter(dark, 0.02 * cells) * fade[:, None] * fade).astype(np.float32)
-        up = self.vertical.astype(np.float32)
-        fall = np.minimum(directions @ up, -1e-6)
-        far = (np.float32(self.floor) - origins @ up) / fall
+        # where each ray meets the floor, in cells of the grid
+        upward = self.vertical.astype(np.float32)
+        fall = np.minimum(directions @ upward, -1e-6)
+        far = (np.float32(self.floor) - origins @ upward) / fall
         place = (origins + far[:, None] * directions) @ across.astype(np.float32)
         place = (place - low.astype(np.float32)) * ((cells - 1) / (high - low)).astype(np.float32)
-        on_floor = (far > 0) & (directions @ up < 0)
+        on_floor = (far > 0) & (directions @ upward < 0)
         inside = np.flatnonzero(on_floor & ((place > 0) & (place < cells - 1)).all(axis=1))
         alpha = np.zeros(len(origins), dtype=np.float32)
         alpha[inside] = map_coordinates(dark, place[inside].T, order=1)
         return alpha
 
     def _floor_darkness(self, across: np.ndarray) -> np.ndarray:
-        """Share of the sky, and of the key light, that the scene takes from points (n, 3) of the floor plane."""
+        """Compute the share of sky and key light that the scene takes from points (n, 3) of the floor."""
         points = across + self.floor * self.vertical
         normals = np.broadcast_to(self.vertical, points.shape)
         sky = 1 - self._open(points, normals, sphere_directions(120), 4 * self.size)
         key = _unit(np.array(KEY[0])) @ self.axes
+        # raise a low key light, so that the shadow does not become longer than the body
         key = _unit(key + max(0.0, 1.3 - float(key @ self.vertical)) * self.vertical)
         return sky + 0.40 * (1 - self._open(points, normals, cone_directions(key, 0.22, 32), 4 * self.size))
 
 
 def _merge_shapes(shapes: Sequence[LitTriangles]) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices (n, 3) float32 and triangles (F, 3) int32 of all shapes: a tree of these is made faster."""
+    """Merge shapes into vertices (n, 3) float32 and triangles (F, 3) int32.
+
+    Corners share their vertices where possible, which speeds up the search tree.
+    """
     vertices, faces, count = [np.zeros((0, 3))], [np.zeros((0, 3), dtype=np.int64)], 0
     for shape in shapes:
         if shape.faces is None or shape.vertex_normals is None:
-            own, places = np.arange(3 * len(shape.corners)).reshape(-1, 3), shape.corners.reshape(-1, 3)
+            shape_faces, places = np.arange(3 * len(shape.corners)).reshape(-1, 3), shape.corners.reshape(-1, 3)
         else:
-            own, places = shape.faces, np.zeros_like(shape.vertex_normals)
-            places[own] = shape.corners
+            shape_faces, places = shape.faces, np.zeros_like(shape.vertex_normals)
+            places[shape_faces] = shape.corners
         vertices.append(places)
-        faces.append(own + count)
+        faces.append(shape_faces + count)
         count += len(places)
     return np.concatenate(vertices).astype(np.float32), np.concatenate(faces).astype(np.int32)
 
 
 class Canvas:
-    """Colour, opacity and depth of `count` rays, painted over and over, then made a picture."""
+    """Colour, opacity and depth of `count` rays, painted layer by layer, then averaged to a picture."""
 
     def __init__(self, count: int) -> None:
-        self.color = np.zeros((count, 3), dtype=np.float32)       # linear, times alpha
+        self.color = np.zeros((count, 3), dtype=np.float32)       # linear light times alpha
         self.alpha = np.zeros(count, dtype=np.float32)
         self.depth = np.full(count, np.inf, dtype=np.float32)
-        self.floor: np.ndarray | None = None                      # alpha of black behind all, one a pixel
+        self.floor: np.ndarray | None = None                      # opacity of the shadow on the floor, one per pixel
 
     def cover(self, seen: Seen, opacity: float = 1.0, through: float = 0.0) -> None:
-        """Paint where nearer than what is there; with the alpha `through` also where hidden.
+        """Paint what is nearer than what is there; with the alpha `through`, also what is hidden.
 
-        What is translucent lets less light pass where it is seen at a slant, as a shell would.
+        Translucent shapes let less light pass at a slant, like a shell.
         """
         rays, depth = seen.rays, seen.depth
         alpha = opacity + (1 - opacity) * (1 - seen.facing) ** 2 if opacity < 1 else 1.0
@@ -194,8 +211,9 @@ class Canvas:
         self.depth[rays[nearer]] = depth[nearer]
 
     def finish(self, width: int, height: int, samples: int) -> np.ndarray:
-        """Average the rays of every pixel and lay them on white."""
+        """Average the rays of every pixel and put them on white."""
         def mean(values: np.ndarray) -> np.ndarray:
+            """Average the samples of each pixel."""
             rows = values.reshape(height * samples, width * samples, -1)
             parts = [rows[i::samples, j::samples] for i in range(samples) for j in range(samples)]
             return np.add.reduce(parts) / len(parts)
@@ -203,13 +221,13 @@ class Canvas:
         color, alpha = mean(self.color), mean(self.alpha)
         if self.floor is not None:
             alpha = alpha + (1 - alpha) * self.floor.reshape(height, width, 1)
-        # White is blended as displayed, so that shadows on it fade evenly.
+        # blend with white in display values, so that shadows fade evenly
         inked = as_seen(np.divide(color, alpha, out=np.zeros_like(color), where=alpha > 0))
         return np.clip(255 * (inked * alpha + 1 - alpha) + 0.5, 0, 255).astype(np.uint8)
 
 
 def sphere_directions(count: int) -> np.ndarray:
-    """Unit vectors (count, 3) spread evenly on a golden spiral."""
+    """Make unit vectors (count, 3) spread evenly over the sphere on a golden spiral."""
     z = 1 - (2 * np.arange(count) + 1) / count
     angle = np.pi * (3 - 5 ** 0.5) * np.arange(count)
     r = np.sqrt(1 - z * z)
@@ -217,7 +235,7 @@ def sphere_directions(count: int) -> np.ndarray:
 
 
 def cone_directions(axis: np.ndarray, radius: float, count: int) -> np.ndarray:
-    """Unit vectors (count, 3) around an axis, at most `radius` radians away."""
+    """Make unit vectors (count, 3) around an axis, at most `radius` radians away."""
     aside = _unit(np.cross(axis, np.eye(3)[np.abs(axis).argmin()]))
     r = radius * np.sqrt((np.arange(count) + 0.5) / count)
     angle = np.pi * (3 - 5 ** 0.5) * np.arange(count)
@@ -226,4 +244,5 @@ def cone_directions(axis: np.ndarray, radius: float, count: int) -> np.ndarray:
 
 
 def _unit(v: np.ndarray) -> np.ndarray:
+    """Scale vectors to length 1; a zero vector stays."""
     return v / np.maximum(np.linalg.norm(v, axis=-1, keepdims=True), 1e-20).astype(v.dtype)

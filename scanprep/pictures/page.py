@@ -1,4 +1,4 @@
-"""A report as one HTML file that needs nothing else."""
+"""A report as one HTML file that needs no other file and no network."""
 from __future__ import annotations
 
 import base64
@@ -20,8 +20,9 @@ from ..judgement import Judgement
 from .scene import Pane, match_camera_scales, pack_scene, picture_panes
 from .sheets import png_bytes, webp_bytes
 
+# folder of the compiled viewer and its style
 VIEWER = Path(__file__).parents[1] / "viewer"
-# The viewer travels compressed: a browser that cannot take it apart, or has no WebGL, goes on showing the pictures.
+# Starts the compressed viewer. A browser that cannot unpack it, or has no WebGL, goes on showing the pictures.
 START = """(async () => {
 const raw = atob(document.getElementById("viewer").textContent), bytes = Uint8Array.from(raw, (c) => c.charCodeAt(0));
 const text = await new Response(new Blob([bytes]).stream().pipeThrough(new DecompressionStream("gzip"))).text();
@@ -30,6 +31,7 @@ script.textContent = text;
 document.head.append(script);
 scapekit.start();
 })().catch((error) => { document.body.classList.add("sk-pictures-only"); throw error; });"""
+# text that is a number, with thousands separators and exponent: set flush right in tables
 NUMBER = re.compile(r"[-+]?[\d,]*\.?\d+(e[-+]?\d+)?")
 
 
@@ -45,57 +47,57 @@ class Page:
         self._scenes: list[bytes] = []
 
     def section(self, title: str, text: str = "") -> Page:
-        """A heading and a paragraph below it."""
+        """Add a heading and a paragraph below it."""
         self._sections.append(title)
         self._parts.append(f'<h2 id="s{len(self._sections)}">{escape(title)}</h2>')
         return self.text(text) if text else self
 
     def text(self, text: str) -> Page:
-        """Paragraphs, separated by empty lines; what stands between backticks is set as code."""
+        """Add paragraphs, separated by empty lines; text between backticks is set as code."""
         self._parts += [f"<p>{_with_code(block.strip())}</p>" for block in text.split("\n\n") if block.strip()]
         return self
 
     def verdict(self, judgement: Judgement, following: str = "") -> Page:
-        """On top of the page: what the result is worth in one word, why, and what to do next in one sentence."""
+        """Put a verdict on top of the page: what the result is worth in one word, why, and what to do next."""
         reasons = f": {_with_code(judgement.why)}" if judgement.reasons else ""
         below = f"<br>{_with_code(following)}" if following else ""
         self._verdict = f'<p class="verdict {judgement.verdict}"><b>{judgement.verdict}</b>{reasons}{below}</p>\n'
         return self
 
     def markup(self, html: str, style: str = "") -> Page:
-        """HTML as it stands, for what the other methods cannot show, and the CSS rules it needs, once each."""
+        """Add raw HTML, for what the other methods cannot show, and the CSS rules that it needs, once each."""
         self._parts.append(html)
         if style and style not in self._styles:
             self._styles.append(style)
         return self
 
     def picture(self, image: np.ndarray | bytes, caption: str = "", alt: str = "") -> Page:
-        """A picture."""
+        """Add a picture."""
         self._parts.append(_figure(image, caption, alt))
         return self
 
     def bodies(self, panes: Sequence[Pane], caption: str = "", height: int = 400,
                picture: np.ndarray | bytes | None = None) -> Page:
-        """Shapes that the reader can turn, one pane beside the other.
+        """Add shapes that the reader can turn, one pane beside the other.
 
-        Where there is no WebGL, and until they are drawn, stands a picture of them, by default what the cameras see.
+        A still picture is shown until they are drawn, and where there is no WebGL; by default what the cameras see.
         """
         panes = match_camera_scales(panes)
         if picture is None:
-            low, camera = min(height, 300), panes[0].camera            # at most 300 pixels high, and 1,400 wide
+            low, camera = min(height, 300), panes[0].camera  # at most 300 pixels high, 1,400 wide
             columns = max(1, int(1400 / max(110, low * camera.width / camera.height + 18)))
             picture = picture_panes(panes, low, columns)
         self._parts.append(self.turning(pack_scene(panes), picture, caption, height))
         return self
 
     def turning(self, scene: bytes, picture: np.ndarray | bytes, caption: str = "", height: int = 400) -> str:
-        """The HTML of a figure of a packed scene, for `markup`; the page carries the scene."""
+        """Return the HTML of a figure with a packed scene, for `markup`; the page carries the scene."""
         self._scenes.append(scene)
         still = _figure(picture if isinstance(picture, bytes) else webp_bytes(picture), caption, "")
         return still.replace("<figure>", f'<figure data-scene="scene{len(self._scenes)}" data-height="{height}">', 1)
 
     def figures(self, metrics: Sequence[Metric], header: Sequence[str] = ("figure", "value", "unit")) -> Page:
-        """The table of figures that a command prints, what it leaves out folded below, and its verdict on top."""
+        """Add the table of figures that a command prints, details folded below, and the verdict on top."""
         judgement = judgement_of(metrics)
         if judgement is not None:
             self.verdict(judgement)
@@ -108,7 +110,7 @@ class Page:
         return self
 
     def table(self, rows: Iterable[Sequence[Any]], header: Sequence[str] = ()) -> Page:
-        """A table; numbers are set flush right, floats with three significant figures."""
+        """Add a table; numbers are flush right, floats have three significant figures."""
         head = "".join(f"<th>{escape(name)}</th>" for name in header)
         body = "".join(f"<tr>{''.join(map(_cell, row))}</tr>" for row in rows)
         head = f"<thead><tr>{head}</tr></thead>" if head else ""
@@ -116,22 +118,24 @@ class Page:
         return self
 
     def chart(self, figure: Any, caption: str = "") -> Page:
-        """A matplotlib figure, as vector graphics; the same figure gives the same bytes."""
+        """Add a matplotlib figure as vector graphics; the same figure gives the same bytes."""
         from matplotlib import rc_context
 
         out = io.BytesIO()
+        # a fixed salt and no date, so that ids in the file do not change from run to run
         with rc_context({"svg.hashsalt": "scapekit"}):
             figure.savefig(out, format="svg", bbox_inches="tight", metadata={"Date": None})
         return self.picture(out.getvalue(), caption)
 
     def html(self) -> str:
-        """The whole page."""
+        """Return the whole page."""
         style = Path(__file__).with_name("page.css").read_text(encoding="utf-8") + "".join(self._styles)
         style += (VIEWER / "viewer.css").read_text(encoding="utf-8") if self._scenes else ""
         lead = f'<p class="lead">{_with_code(self.lead)}</p>' if self.lead else ""
+        # a table of contents, from three sections on
         links = "".join(f'<a href="#s{i + 1}">{escape(s)}</a>' for i, s in enumerate(self._sections))
         nav = f'<nav aria-label="Contents">{links}</nav>' if len(self._sections) > 2 else ""
-        # what makes bodies turn: the scenes, the viewer, and its start; nothing on a page of pictures alone
+        # for bodies that turn: scenes, viewer and its start script; nothing on a page with pictures only
         carried = {f"scene{i + 1}": scene for i, scene in enumerate(self._scenes)}
         carried |= {"viewer": _viewer_code()} if carried else {}
         viewer = "".join(f'<script type="text/plain" id="{name}">{base64.b64encode(data).decode()}</script>\n'
@@ -143,26 +147,28 @@ class Page:
                 + "\n".join(self._parts) + "\n</main>\n" + viewer + "</body>\n</html>\n")
 
     def write(self, path: str | Path) -> None:
-        """Write the page, whole or not at all."""
+        """Write the page to a file, completely or not at all."""
         write_file(path, self.html())
 
 
 def link_to(name: str) -> str:
-    """The address of a file or folder beside a page, whatever its name holds."""
+    """Return the address of a file or folder beside a page, whatever its name contains."""
     return quote(name, errors="surrogateescape")
 
 
 def _with_code(text: str) -> str:
-    """A sentence as HTML, commands and names of files between backticks set as code."""
+    """Convert a sentence to HTML; commands and file names between backticks are set as code."""
     return re.sub(r"`([^`\n]+)`", r"<code>\1</code>", escape(text))
 
 
 @functools.cache
 def _viewer_code() -> bytes:
+    """Return the compressed viewer; the same bytes every time, as the archive has no date."""
     return gzip.compress((VIEWER / "viewer.js").read_bytes(), 9, mtime=0)
 
 
 def _figure(image: np.ndarray | bytes, caption: str, alt: str) -> str:
+    """Return the HTML of a picture with its caption."""
     data = image if isinstance(image, bytes) else png_bytes(image)
     below = f"<figcaption>{_with_code(caption)}</figcaption>" if caption else ""
     source = data_uri(data)
@@ -171,7 +177,8 @@ def _figure(image: np.ndarray | bytes, caption: str, alt: str) -> str:
 
 
 def data_uri(data: bytes) -> str:
-    """The bytes of a picture as the address of an `img`."""
+    """Return the bytes of a picture as the address of an `img`."""
+    # the kind of picture follows from its first bytes
     signatures = {b"\x89PNG": "image/png", b"GIF8": "image/gif", b"\xff\xd8\xff": "image/jpeg",
                   b"RIFF": "image/webp"}
     kind = next((kind for start, kind in signatures.items() if data.startswith(start)), None)
@@ -183,6 +190,7 @@ def data_uri(data: bytes) -> str:
 
 
 def _cell(value: Any) -> str:
+    """Return the HTML of one cell of a table."""
     if isinstance(value, bool | np.bool_):
         return f"<td>{'yes' if value else 'no'}</td>"
     if isinstance(value, int | np.integer):
@@ -191,5 +199,5 @@ def _cell(value: Any) -> str:
         shown = "–" if np.isnan(value) else f"{value:.3g}" if abs(value) < 1000 else f"{value:,.0f}"
         return f'<td class="number">{shown}</td>'
     number = ' class="number"' if NUMBER.fullmatch(str(value)) else ""
-    breaking = re.sub(r"(?<=\w)/(?=\w)", "/<wbr>", _with_code(str(value)))      # a long path, on a narrow page
+    breaking = re.sub(r"(?<=\w)/(?=\w)", "/<wbr>", _with_code(str(value)))      # long paths may break
     return f"<td{number}>{breaking}</td>"

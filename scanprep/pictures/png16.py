@@ -1,4 +1,4 @@
-"""PNG images with 16 bits a channel: Pillow reads grey ones, but of coloured ones only the upper eight bits."""
+"""Read PNG images with 16 bits per channel: Pillow keeps only the upper eight bits of coloured ones."""
 from __future__ import annotations
 
 import struct
@@ -7,25 +7,26 @@ import zlib
 import numpy as np
 
 SIGNATURE = b"\x89PNG\r\n\x1a\n"
-CHANNELS = {0: 1, 2: 3, 4: 2, 6: 4}
-MOST = 2**28                         # pixels
+CHANNELS = {0: 1, 2: 3, 4: 2, 6: 4}  # colour type of the PNG standard -> channels; a palette (3) has none
+MOST = 2**28                         # pixels: a small file could unpack to one that fills the memory
 
 
 def depth(data: bytes) -> tuple[int, int]:
-    """Bits and channels of a PNG file; channels 0 where it has a palette."""
+    """Return bits and channels of a PNG file; channels are 0 where it has a palette."""
     if data[:8] != SIGNATURE or data[12:16] != b"IHDR" or len(data) < 33:
         raise ValueError("it is not a PNG file")
     return data[24], CHANNELS.get(data[25], 0)
 
 
 def decode_png16(data: bytes) -> np.ndarray:
-    """(H, W, C) uint16 of a PNG file with 16 bits a channel."""
+    """Decode a PNG file with 16 bits per channel to (H, W, C) uint16."""
     bits, channels = depth(data)
     width, height = struct.unpack(">II", data[16:24])
     if bits != 16 or not channels or data[28]:
         raise ValueError("expected 16 bits a channel, not interlaced")
     if not 0 < width * height <= MOST:
         raise ValueError(f"expected up to {MOST} pixels, got {width} x {height}")
+    # each row is one byte for its filter, then two bytes per channel, high byte first
     row = 1 + 2 * channels * width
     try:
         raw = zlib.decompressobj().decompress(b"".join(_chunks(data, b"IDAT")), row * height + 1)
@@ -39,19 +40,20 @@ def decode_png16(data: bytes) -> np.ndarray:
 
 
 def _chunks(data: bytes, wanted: bytes) -> list[bytes]:
-    found, at = [], 8
+    """Return the contents of all chunks of a kind."""
+    contents, at = [], 8
     while at + 8 <= len(data):
         length = int.from_bytes(data[at:at + 4], "big")
         if data[at + 4:at + 8] == wanted:
-            found.append(data[at + 8:at + 8 + length])
+            contents.append(data[at + 8:at + 8 + length])
         at += 12 + length
-    return found
+    return contents
 
 
 def _unfilter(stored: np.ndarray, kinds: np.ndarray) -> np.ndarray:
-    """Bytes (H, W, B) from how they differ from those to the left, above and above left, as each row's filter says.
+    """Undo the row filters of PNG: bytes (H, W, B) from their differences to those left, above and above left.
 
-    A pixel needs only pixels of earlier diagonals, so a diagonal is done at once.
+    A pixel depends only on pixels of earlier diagonals, so a whole diagonal is computed at once.
     """
     if (kinds > 4).any():
         raise ValueError(f"unknown filter {kinds.max()}")
@@ -61,9 +63,10 @@ def _unfilter(stored: np.ndarray, kinds: np.ndarray) -> np.ndarray:
         y = np.arange(max(0, diagonal - width + 1), min(height, diagonal + 1))
         x = diagonal - y
         a, b, c = out[y + 1, x], out[y, x + 1], out[y, x]
+        # Paeth predictor: the neighbour nearest to a + b - c
         p, q, r = np.abs(b - c), np.abs(a - c), np.abs(a + b - 2 * c)
         paeth = np.where((p <= q) & (p <= r), a, np.where(q <= r, b, c))
         kind = kinds[y, None]
-        guess = np.choose(kind, [np.zeros_like(a), a, b, (a + b) // 2, paeth])
-        out[y + 1, x + 1] = (stored[y, x] + guess) & 255
+        prediction = np.choose(kind, [np.zeros_like(a), a, b, (a + b) // 2, paeth])
+        out[y + 1, x + 1] = (stored[y, x] + prediction) & 255
     return out[1:, 1:].astype(np.uint16)

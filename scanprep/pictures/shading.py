@@ -1,7 +1,7 @@
-"""Shaded pictures by casting rays: no graphics card, no display.
+"""Render shaded pictures by ray casting, without graphics card or display.
 
-Key, fill and rim light move with the camera. Ambient occlusion and the soft shadow of the key light are computed
-at the vertices in sight and interpolated, which keeps them free of noise.
+Key, fill and rim light move with the camera. Ambient occlusion and the soft shadow of the key light are computed at
+the visible vertices and interpolated, which avoids noise.
 """
 from __future__ import annotations
 
@@ -34,32 +34,32 @@ __all__ = [
     "save_png",
 ]
 
-CLAY = (0.79, 0.76, 0.725)
+CLAY = (0.79, 0.76, 0.725)           # colour of plain bodies: light, so that shading shows
 
 
 @dataclass(frozen=True, eq=False)
 class Solid:
-    """A mesh and how it looks."""
+    """A mesh and its appearance."""
 
     mesh: Mesh
     # (3,), (N, 3) per vertex or (F, 3) per triangle, in [0, 1]; by default the mesh's own colours, else clay
     color: np.ndarray | Sequence[float] | Heat | None = None
-    opacity: float = 1.0  # below 1 what lies behind shines through
-    smooth: bool = True  # interpolate normals: false shows the single triangles
-    name: str = ""  # in the browser, where shapes with a name can be hidden
+    opacity: float = 1.0  # below 1 it is translucent
+    smooth: bool = True  # interpolate normals; False shows the facets
+    name: str = ""  # in the browser shapes with a name can be hidden
     shades: Mapping[str, np.ndarray | Heat] = field(default_factory=dict)  # other colours to choose from in the browser
-    visible: bool = True  # at first: a name brings it into sight
+    visible: bool = True  # at first; shapes with a name can be shown later
 
 
 @dataclass(frozen=True, eq=False)
 class Dots:
     """Small balls: markers, joints, landmarks."""
 
-    points: np.ndarray  # (n, 3) float, metres: points that are not finite are left out
+    points: np.ndarray  # (n, 3) float, metres; points that are not finite are left out
     color: np.ndarray | Sequence[float] | Heat = (0.86, 0.24, 0.20)  # (3,) or (n, 3) in [0, 1]
     radius: float = 0.012  # metres
-    on_top: bool = False  # seen through the meshes in front of them
-    coarse: bool = False  # balls of few triangles, for pictures in which they are a few pixels wide
+    on_top: bool = False  # visible through the meshes in front of them
+    coarse: bool = False  # balls of few triangles, for dots a few pixels wide
     name: str = ""
     labels: Sequence[str] = ()  # of each point, shown in the browser
     visible: bool = True
@@ -80,7 +80,7 @@ class Bones:
 
 @dataclass(frozen=True, eq=False)
 class Moving:
-    """A shape in motion, for the browser; pictures show it as it is."""
+    """A shape in motion, for the browser; pictures show its first frame."""
 
     shape: Solid | Dots
     frames: np.ndarray  # (T, n, 3) float, metres: of its vertices or points
@@ -94,17 +94,34 @@ Shape = Mesh | Solid | Dots | Bones
 
 def render(shapes: Shape | Sequence[Shape], camera: Camera, width: int, height: int, ground: bool = False
            ) -> np.ndarray:
-    """A shaded picture (height, width, 3) uint8 on white; `ground`: a soft shadow on the floor below the lowest point.
+    """Render a shaded picture on a white background.
+
+    Parameters
+    ----------
+    shapes : Mesh, Solid, Dots, Bones, or sequence of these
+        What is seen.
+    camera : Camera
+        Where it is seen from.
+    width, height : int, pixels
+        Size of the picture.
+    ground : bool
+        Draw a soft shadow on the floor below the lowest point.
+
+    Returns
+    -------
+    (height, width, 3) uint8
     """
     everything = [shapes] if isinstance(shapes, Shape) else list(shapes)
     origins, directions = camera.rays(width, height, samples=2)
     canvas = Canvas(len(origins))
+    # opaque shapes in one search tree, so that they cast shadows on each other
     solid = [s for s in everything if not _on_top(s) and _opacity(s) == 1]
     if solid:
         scene = _scene(solid, camera)
         canvas.cover(scene.cast(origins, directions))
         if ground and np.isfinite(scene.floor):
             canvas.floor = scene.ground_shadow(*camera.rays(width, height))
+    # translucent shapes are blended over them, and what is on top shows through all
     for shape in everything:
         if _opacity(shape) < 1:
             canvas.cover(_scene([shape], camera).cast(origins, directions), opacity=_opacity(shape))
@@ -115,19 +132,22 @@ def render(shapes: Shape | Sequence[Shape], camera: Camera, width: int, height: 
 
 
 def _on_top(shape: Shape) -> bool:
+    """Return whether a shape is visible through others."""
     return isinstance(shape, Dots | Bones) and shape.on_top
 
 
 def _opacity(shape: Shape) -> float:
+    """Return the opacity of a shape."""
     return shape.opacity if isinstance(shape, Solid) else 1.0
 
 
 def _scene(shapes: Sequence[Shape], camera: Camera) -> Scene:
+    """Build the scene of some shapes under a camera."""
     return Scene([_triangles(shape, camera.target) for shape in shapes], camera.axes, camera.vertical)
 
 
 def _triangles(shape: Shape, origin: np.ndarray) -> LitTriangles:
-    """The triangles of a shape, moved so that `origin` is at 0."""
+    """Convert a shape to triangles, moved so that `origin` is at 0."""
     if isinstance(shape, Mesh):
         shape = Solid(shape)
     if isinstance(shape, Solid):
@@ -139,28 +159,28 @@ def _triangles(shape: Shape, origin: np.ndarray) -> LitTriangles:
                             mesh.faces, mesh.vertex_normals)
     if isinstance(shape, Dots):
         points = np.atleast_2d(np.asarray(shape.points, dtype=float))
-        use = np.isfinite(points).all(axis=1)
-        corners, normals, owner = balls(points[use] - origin, shape.radius, 1 if shape.coarse else None)
+        finite = np.isfinite(points).all(axis=1)
+        corners, normals, owner = balls(points[finite] - origin, shape.radius, 1 if shape.coarse else None)
         count = len(points)
     else:
         starts, ends = np.atleast_2d(shape.starts), np.atleast_2d(shape.ends)
-        use = np.isfinite(starts).all(axis=1) & np.isfinite(ends).all(axis=1)
-        corners, normals, owner = capsules(starts[use] - origin, ends[use] - origin, shape.radius)
+        finite = np.isfinite(starts).all(axis=1) & np.isfinite(ends).all(axis=1)
+        corners, normals, owner = capsules(starts[finite] - origin, ends[finite] - origin, shape.radius)
         count = len(starts)
-    given = shape.color.colors() if isinstance(shape.color, Heat) else shape.color
-    color = as_light(np.broadcast_to(np.asarray(given, dtype=float), (count, 3)))[use][owner]
+    own_colors = shape.color.colors() if isinstance(shape.color, Heat) else shape.color
+    color = as_light(np.broadcast_to(np.asarray(own_colors, dtype=float), (count, 3)))[finite][owner]
     return LitTriangles(corners, normals, np.repeat(color[:, None], 3, axis=1))
 
 
 def own_color(solid: Solid) -> np.ndarray | Sequence[float]:
-    """What a mesh is coloured by: what was said, else its own colours, else clay."""
+    """Return the colours of a mesh: those of the solid, else those of the mesh, else clay."""
     if isinstance(solid.color, Heat):
         return solid.color.colors()
     return solid.color if solid.color is not None else CLAY if solid.mesh.colors is None else solid.mesh.colors
 
 
 def _corner_colors(color: np.ndarray, mesh: Mesh) -> np.ndarray:
-    """(F, 3, 3) linear light at the corners of every triangle."""
+    """Return linear light (F, 3, 3) at the corners of every triangle."""
     linear = as_light(color)
     if color.shape == (3,):
         return np.broadcast_to(linear, (len(mesh.faces), 3, 3))
@@ -173,7 +193,7 @@ def _corner_colors(color: np.ndarray, mesh: Mesh) -> np.ndarray:
 
 
 def sphere(divisions: int) -> tuple[np.ndarray, np.ndarray]:
-    """A unit sphere as an icosahedron whose triangles are cut in four `divisions` times."""
+    """Make a unit sphere: an icosahedron whose triangles are cut into four `divisions` times."""
     import igl
 
     vertices, faces = igl.icosahedron()
@@ -185,12 +205,12 @@ def sphere(divisions: int) -> tuple[np.ndarray, np.ndarray]:
 
 def balls(points: np.ndarray, radius: float, divisions: int | None = None
           ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """One ball for each point (n, 3): corners and normals (f, 3, 3) of the triangles, and the point (f,) of each.
+    """Make a ball for each point (n, 3): corners and normals (f, 3, 3) of triangles, and the point (f,) of each.
 
-    How round, as for `sphere`, goes by their number when it is not given.
+    `divisions` is as for `sphere`; by default many balls are coarser than few.
     """
-    # up to so many balls are cut in finer triangles, and finer again
-    vertices, faces = sphere(divisions if divisions is not None else sum(len(points) <= few for few in (4000, 400)))
+    # up to 4000 balls are divided once, up to 400 twice: the number of triangles stays within bounds
+    vertices, faces = sphere(divisions if divisions is not None else sum(len(points) <= limit for limit in (4000, 400)))
     normals = vertices[faces]
     corners = points[:, None, None, None, :].swapaxes(1, 2) + radius * normals
     count = len(points)
@@ -198,13 +218,15 @@ def balls(points: np.ndarray, radius: float, divisions: int | None = None
 
 
 def capsules(starts: np.ndarray, ends: np.ndarray, radius: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """One rod with round ends for each pair of points (n, 3), in the form of `balls`."""
+    """Make a rod with round ends for each pair of points (n, 3), in the form of `balls`."""
     count, sides = len(starts), 16
+    # axis of each rod, and two directions across it; a rod of length 0 gets an arbitrary axis
     along = ends - starts
     length = np.linalg.norm(along, axis=1, keepdims=True)
     along = np.divide(along, length, out=np.tile([0.0, 0.0, 1.0], (count, 1)), where=length > 0)
     aside = np.cross(along, np.eye(3)[np.abs(along).argmin(axis=1)])
     aside /= np.linalg.norm(aside, axis=1, keepdims=True)
+    # a ring of 16 sides around it, each side two triangles
     angle = 2 * np.pi * np.arange(sides) / sides
     ring = (np.cos(angle)[:, None] * aside[:, None] + np.sin(angle)[:, None] * np.cross(along, aside)[:, None])
     following = np.roll(ring, -1, axis=1)

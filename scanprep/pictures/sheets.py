@@ -1,4 +1,4 @@
-"""Pictures put together, written to files, and moving ones as GIF."""
+"""Contact sheets of pictures, picture files, and animated GIFs."""
 from __future__ import annotations
 
 import io
@@ -9,11 +9,11 @@ import numpy as np
 
 from ..geometry.storage import read_bytes, write_file
 
-INK = (58, 62, 68)
+INK = (58, 62, 68)                   # colour of text: dark grey, softer than black
 
 
 def font(size: int):
-    """The typeface that Pillow carries, so that labels look alike everywhere."""
+    """Return the typeface that Pillow contains, so that labels look the same on every machine."""
     from PIL import ImageFont
 
     return ImageFont.load_default(size=size)
@@ -21,9 +21,22 @@ def font(size: int):
 
 def contact_sheet(images: Sequence[np.ndarray], labels: Sequence[str] | None = None, gap: int = 8,
                   columns: int | None = None) -> np.ndarray:
-    """A contact sheet (H, W, 3) uint8 of pictures of any sizes with a line of text below each.
+    """Put pictures of any size side by side, each centred in its cell with a line of text below.
 
-    All stand in one row unless `columns` says otherwise; each is centred in its cell.
+    Parameters
+    ----------
+    images : sequence of (h, w, 3) uint8
+        The pictures.
+    labels : sequence of str, optional
+        One for each picture.
+    gap : int, pixels
+        Space between cells.
+    columns : int, optional
+        Pictures in a row; by default all.
+
+    Returns
+    -------
+    (H, W, 3) uint8
     """
     from PIL import Image, ImageDraw
 
@@ -32,6 +45,7 @@ def contact_sheet(images: Sequence[np.ndarray], labels: Sequence[str] | None = N
     if labels is not None and len(labels) != len(images):
         raise ValueError(f"labels: expected {len(images)}, one for each image, got {len(labels)}")
     columns = min(columns or len(images), len(images))
+    # the widest picture or label sets the width of all cells, the highest picture of a row its height
     rows = -(-len(images) // columns)
     text = 24 if labels else 0
     cell_w = max([*(i.shape[1] for i in images), *(int(font(15).getlength(label)) + 2 * gap for label in labels or ())])
@@ -49,25 +63,26 @@ def contact_sheet(images: Sequence[np.ndarray], labels: Sequence[str] | None = N
 
 
 def png_bytes(image: np.ndarray) -> bytes:
-    """A picture (H, W, 3) uint8, or grey (H, W) uint8 or uint16, as PNG."""
+    """Encode a picture (H, W, 3) uint8, or grey (H, W) uint8 or uint16, as PNG."""
     from PIL import Image
 
     out = io.BytesIO()
-    Image.fromarray(image).save(out, format="PNG", optimize=image.size < 4_000_000)      # larger ones would take long
+    Image.fromarray(image).save(out, format="PNG", optimize=image.size < 4_000_000)      # too slow for larger
     return out.getvalue()
 
 
 def webp_bytes(image: np.ndarray) -> bytes:
-    """A picture (H, W, 3) uint8 as a WebP file, a tenth of the size of a PNG."""
+    """Encode a picture (H, W, 3) uint8 as WebP, a tenth of the size of a PNG."""
     from PIL import Image
 
     out = io.BytesIO()
+    # quality at which compression does not show on shaded bodies
     Image.fromarray(image).save(out, format="WEBP", quality=82, method=4)
     return out.getvalue()
 
 
 def small_picture(path: Path, width: int = 700) -> bytes:
-    """The picture of a file as a WebP file, no wider than so many pixels."""
+    """Read a picture from a file and encode it as WebP, no wider than `width` pixels."""
     from PIL import Image
 
     with Image.open(io.BytesIO(read_bytes(path, "a picture"))) as image:
@@ -76,32 +91,33 @@ def small_picture(path: Path, width: int = 700) -> bytes:
 
 
 def save_png(path: str | Path, image: np.ndarray) -> None:
-    """Write a picture (H, W, 3) uint8, whole or not at all."""
+    """Write a picture (H, W, 3) uint8, completely or not at all."""
     write_file(path, png_bytes(image))
 
 
 def gif_bytes(images: Sequence[np.ndarray], rate: float) -> bytes:
-    """Pictures (H, W, 3) uint8 as an endless animated GIF of `rate` pictures a second.
+    """Encode pictures (H, W, 3) uint8 as an endless animated GIF of `rate` pictures per second.
 
-    All share one palette, so that nothing flickers.
+    All share one palette, so that colours do not flicker.
     """
     from PIL import Image
 
     if not len(images):
         raise ValueError("images: expected at least one, got none")
+    # the palette is computed from about six of the pictures, at half their size
     step = max(1, len(images) // 6)
     palette = Image.fromarray(np.concatenate([i[::2, ::2] for i in images[::step]])).quantize(
         255, method=Image.Quantize.MEDIANCUT)
     colors = np.array(palette.getpalette()).reshape(-1, 3)
-    colors[colors.sum(axis=1).argmax()] = 255                 # the background of most pictures
+    colors[colors.sum(axis=1).argmax()] = 255     # the lightest becomes white, the usual background
     palette.putpalette(colors.ravel().tolist())
-    drawn = [Image.fromarray(i).quantize(palette=palette, dither=Image.Dither.FLOYDSTEINBERG) for i in images]
+    frames = [Image.fromarray(i).quantize(palette=palette, dither=Image.Dither.FLOYDSTEINBERG) for i in images]
     out = io.BytesIO()
-    drawn[0].save(out, format="GIF", save_all=True, append_images=drawn[1:], loop=0,
+    frames[0].save(out, format="GIF", save_all=True, append_images=frames[1:], loop=0,
                   duration=max(20, round(1000 / rate / 10) * 10), optimize=False)
     return out.getvalue()
 
 
 def write_gif(path: str | Path, images: Sequence[np.ndarray], rate: float) -> None:
-    """Write `gif_bytes`, whole or not at all."""
+    """Write pictures as an animated GIF, completely or not at all."""
     write_file(path, gif_bytes(images, rate))

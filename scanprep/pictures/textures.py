@@ -1,4 +1,4 @@
-"""Textures: read with a scan, baked onto a body, written as GLB."""
+"""Textures: read them with a scan, bake them onto a body, write them as GLB."""
 from __future__ import annotations
 
 import io
@@ -19,7 +19,7 @@ from ..geometry.surface import Rays, barycentric
 from .gltf import skin_material
 from .sheets import png_bytes
 
-# colours and weights of places with normals
+# function of places (n, 3) and their normals (n, 3) that returns colours (n, 3) and weights (n,)
 Look = Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]
 
 
@@ -27,28 +27,30 @@ Look = Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]
 class Texture:
     """A picture laid on a mesh."""
 
-    mesh: Mesh  # its vertices are repeated where charts meet
-    # (N, 2) float: place of each vertex in the picture: (0, 0) is its lower left corner, (1, 1) its upper right one
+    mesh: Mesh  # vertices are repeated along the seams between charts
+    # (N, 2) float: place of each vertex in the picture, (0, 0) at its lower left corner, (1, 1) at its upper right one
     uv: np.ndarray
     image: np.ndarray  # (H, W, 3) float in [0, 1]: rows from the top
 
     def scale_by(self, factor: float) -> Texture:
-        """All lengths of the mesh times a factor."""
+        """Return the texture with all lengths of the mesh multiplied by a factor."""
         return self if factor == 1 else replace(self, mesh=self.mesh.with_vertices(factor * self.mesh.vertices))
 
     def sample(self, faces: np.ndarray, bary: np.ndarray) -> np.ndarray:
-        """Colours (n, 3) at points on triangles, interpolated between pixels."""
+        """Interpolate colours (n, 3) at points on triangles, given by barycentric coordinates."""
+        # places repeat outside 0 to 1; exactly 1 must stay 1 and not wrap to 0
         return bilinear(self.image, np.einsum("nc,ncd->nd", bary, self.uv[self.mesh.faces[faces]]) % 1.0000001)
 
 
 def bilinear(image: np.ndarray, uv: np.ndarray) -> np.ndarray:
-    """Values (n,) or (n, C) of an image (H, W) or (H, W, C) at places (n, 2), interpolated between pixels.
+    """Interpolate values of an image (H, W) or (H, W, C) at places (n, 2): (n,) or (n, C).
 
     (0, 0) is the lower left corner of the image, (1, 1) its upper right one; rows from the top.
     """
     from scipy.ndimage import map_coordinates
 
     height, width = image.shape[:2]
+    # centres of pixels are at half numbers
     place = (1 - uv[:, 1]) * height - 0.5, uv[:, 0] * width - 0.5
     channels = np.moveaxis(np.asarray(image, dtype=float).reshape(height, width, -1), 2, 0)
     values = np.stack([map_coordinates(channel, place, order=1, mode="nearest") for channel in channels], axis=1)
@@ -56,43 +58,61 @@ def bilinear(image: np.ndarray, uv: np.ndarray) -> np.ndarray:
 
 
 def check_pixels(size: Sequence[int]) -> None:
-    """ValueError for a picture of more pixels than are read: a small file may unpack to one that fills the memory."""
-    # pixels; the largest that scanners write, 1.6 GB when it is worked with
+    """Raise ValueError for a picture of too many pixels: a small file may unpack to one that fills the memory."""
+    # largest picture that scanners write; it takes 1.6 GB of memory
     if math.prod(size) > (8192**2):
         raise ValueError(f"{' x '.join(map(str, size))} pixels, expected at most 8192 x 8192")
 
 
 def read_texture(path: str | Path, unit: str | None = None) -> Texture | None:
-    """The texture of an OBJ with its MTL, or of a GLB; None where the file has none.
+    """Read the texture of an OBJ with its MTL, or of a GLB; None where the file has none.
 
     Warns where the file names a material whose picture cannot be found.
+
+    Parameters
+    ----------
+    path : str or Path
+        File of the mesh.
+    unit : str, optional
+        Unit of the mesh, where the file does not say.
+
+    Returns
+    -------
+    Texture or None
+
+    Raises
+    ------
+    ValueError
+        The mesh cannot be read.
     """
     path = Path(path)
-    if not _names_a_picture(path):
+    # a quick look at the bytes: most meshes refer to no picture, and need not be read twice
+    word = {".obj": b"mtllib", ".glb": b'"images"'}.get(path.suffix.lower())
+    if word is None or word not in load_bytes(path):
         return None
     import trimesh
 
-    beside = _beside(path)
+    resolver = _beside(path)
     try:
         with open(path, "rb") as file:
-            loaded = trimesh.load_mesh(file, file_type=path.suffix[1:].lower(), resolver=beside, process=False)
-    except Exception as error:           # trimesh raises whatever its readers raise
+            loaded = trimesh.load_mesh(file, file_type=path.suffix[1:].lower(), resolver=resolver, process=False)
+    except Exception as error:           # trimesh passes on any error of its readers
         raise ValueError(f"{path}: expected a mesh with a texture, cannot read it ({error})") from None
-    lost = "; ".join(beside.problems.values())
+    problems = "; ".join(resolver.problems.values())
     visual = loaded.visual
-    # (H, W, 3) of a material of trimesh, or None
-    found = (getattr(getattr(visual, "material", None), name, None) for name in ("image", "baseColorTexture"))
-    image = next((image for image in found if image is not None), None)
+    # the picture is in one of two attributes, by kind of material
+    pictures = (getattr(getattr(visual, "material", None), name, None) for name in ("image", "baseColorTexture"))
+    image = next((image for image in pictures if image is not None), None)
     image = None if image is None else np.asarray(image.convert("RGB"), dtype=np.float64) / 255
     uv = getattr(visual, "uv", None)
     if image is None or uv is None or len(uv) != len(loaded.vertices):
         warnings.warn(f"{path}: it names a texture, but its material file or picture cannot be read; "
-                      f"its colours are left out{f' ({lost})' if lost else ''}", stacklevel=2)
+                      f"its colours are left out{f' ({problems})' if problems else ''}", stacklevel=2)
         return None
-    if lost:
-        warnings.warn(f"{path}: some of its pictures cannot be read, what they show is grey ({lost})", stacklevel=2)
+    if problems:
+        warnings.warn(f"{path}: some of its pictures cannot be read, what they show is grey ({problems})", stacklevel=2)
     vertices = np.asarray(loaded.vertices, dtype=np.float64)
-    with warnings.catch_warnings():          # whoever reads the mesh tells its unit
+    with warnings.catch_warnings():          # the reader of the mesh warns about the unit already
         warnings.simplefilter("ignore", UserWarning)
         vertices = metres_per_unit(path, vertices, unit) * vertices
     if path.suffix.lower() == ".glb":
@@ -102,9 +122,9 @@ def read_texture(path: str | Path, unit: str | None = None) -> Texture | None:
 
 
 def _beside(path: Path) -> Any:
-    """What gives trimesh the files that a mesh names, and keeps why one cannot be had.
+    """Make the object through which trimesh reads files named by a mesh; it keeps why one cannot be read.
 
-    They lie beside the mesh or below.
+    Only files beside the mesh or below are read.
     """
     from PIL import Image
     from trimesh.resolvers import Resolver
@@ -135,47 +155,57 @@ def _beside(path: Path) -> Any:
     return Beside()
 
 
-def _names_a_picture(path: Path) -> bool:
-    ending = path.suffix.lower()
-    if ending not in (".obj", ".glb"):
-        return False
-    data = load_bytes(path)
-    return b"mtllib" in data if ending == ".obj" else b'"images"' in data
-
-
 def bake_texture(body: Mesh, look: Look, unseen: np.ndarray, size: int = 1024) -> Texture:
-    """A texture of a body: what `look` says of its pixels, where its weight is zero `unseen` (N, 3) of the vertices."""
-    kept, faces, uv = unwrap(body)
+    """Bake a texture of a body.
+
+    Parameters
+    ----------
+    body : Mesh
+        The body.
+    look : callable
+        Returns colours (n, 3) and weights (n,) of places (n, 3) with normals (n, 3).
+    unseen : (N, 3) float in [0, 1]
+        Colours of vertices, used where the weight is zero.
+    size : int, pixels
+        Width and height of the picture.
+
+    Returns
+    -------
+    Texture
+    """
+    old_vertex, faces, uv = unwrap(body)
+    # lay the charts flat, and find the triangle under each pixel by a ray
     flat = Mesh(np.column_stack([uv, np.zeros(len(uv))]), faces)
-    at = (np.arange(size) + 0.5) / size
-    x, y = np.meshgrid(at, at[::-1])
+    centres = (np.arange(size) + 0.5) / size
+    x, y = np.meshgrid(centres, centres[::-1])
     pixels = np.column_stack([x.ravel(), y.ravel(), np.ones(size**2)])
-    face, _ = Rays(flat).cast(pixels, np.array([0.0, 0.0, -1.0]))    # from above, through charts of either side
+    face, _ = Rays(flat).cast(pixels, np.array([0.0, 0.0, -1.0]))    # straight down; charts may face either way
     covered = np.flatnonzero(face >= 0)
-    corners = kept[faces[face[covered]]]
+    # place, normal and colour of the body at each covered pixel
+    corners = old_vertex[faces[face[covered]]]
     bary = barycentric(pixels[covered] * (1, 1, 0), flat.corners[face[covered]])
     places, normals, plain = (np.einsum("nc,ncd->nd", bary, values[corners])
                               for values in (body.vertices, body.vertex_normals, unseen))
     colors, weight = look(places, normals / np.maximum(np.linalg.norm(normals, axis=1), 1e-12)[:, None])
     image = np.full((size * size, 3), unseen.mean())
     image[covered] = np.where(weight[:, None] > 0, colors, plain)
-    return Texture(Mesh(body.vertices[kept], faces), uv, pad_charts(image.reshape(size, size, 3),
+    return Texture(Mesh(body.vertices[old_vertex], faces), uv, pad_charts(image.reshape(size, size, 3),
                                                                  (face >= 0).reshape(size, size)))
 
 
 def unwrap(mesh: Mesh) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """A mesh in flat charts: the old vertex of each new one (n,), the triangles in the old order, uv (n, 2)."""
+    """Cut a mesh into flat charts: the old vertex of each new one (n,), triangles in the old order, uv (n, 2)."""
     try:
         import xatlas
     except ModuleNotFoundError:
         raise ModuleNotFoundError("a texture needs the body unwrapped by xatlas: "
                                   "pip install 'scapekit[textures]'") from None
-    kept, faces, uv = xatlas.parametrize(mesh.vertices.astype(np.float32), mesh.faces.astype(np.uint32))
-    return kept.astype(np.int64), faces.astype(np.int64), uv.astype(np.float64)
+    old_vertex, faces, uv = xatlas.parametrize(mesh.vertices.astype(np.float32), mesh.faces.astype(np.uint32))
+    return old_vertex.astype(np.int64), faces.astype(np.int64), uv.astype(np.float64)
 
 
 def pad_charts(image: np.ndarray, covered: np.ndarray) -> np.ndarray:
-    """The picture with the colours of charts going on eight pixels beyond them, so that seams do not show."""
+    """Continue the colours of charts eight pixels beyond their edges, so that seams do not show."""
     from scipy.ndimage import distance_transform_edt
 
     far, nearest = distance_transform_edt(~covered, return_indices=True)
@@ -183,10 +213,10 @@ def pad_charts(image: np.ndarray, covered: np.ndarray) -> np.ndarray:
 
 
 def write_textured(path: str | Path, texture: Texture) -> None:
-    """Write a GLB with its picture inside, whole or not at all."""
+    """Write a textured mesh as GLB with its picture inside, completely or not at all."""
     glb, up = Glb(), tallest(texture.mesh.vertices)
-    U, mesh = turn_up(up).T, texture.mesh
-    surface = glb.add_surface(Mesh(mesh.vertices @ U, mesh.faces), _normals(mesh) @ U, texture.uv)
+    turn, mesh = turn_up(up).T, texture.mesh
+    surface = glb.add_surface(Mesh(mesh.vertices @ turn, mesh.faces), _normals(mesh) @ turn, texture.uv)
     material = skin_material((1, 1, 1))
     material["pbrMetallicRoughness"]["baseColorTexture"] = {"index": 0}
     image = glb.add_png(png_bytes((255 * np.clip(texture.image, 0, 1) + 0.5).astype(np.uint8)), "texture")
@@ -195,7 +225,7 @@ def write_textured(path: str | Path, texture: Texture) -> None:
 
 
 def _normals(mesh: Mesh) -> np.ndarray:
-    """(N, 3) unit normals, the same for all vertices of one place: they are repeated along the seams of the picture."""
+    """Compute unit normals (N, 3), equal for vertices at the same place, which are repeated along seams."""
     _, first, place = np.unique(mesh.vertices, axis=0, return_index=True, return_inverse=True)
     place = place.reshape(-1)
     return some_normal(Mesh(mesh.vertices[first], place[mesh.faces]))[place]

@@ -1,4 +1,4 @@
-"""Fewer triangles for a mesh that is only looked at."""
+"""Reduce the triangles of a mesh that is only looked at."""
 from __future__ import annotations
 
 from dataclasses import replace
@@ -10,16 +10,17 @@ from ..geometry.mesh import Mesh
 from .colors import Heat
 from .shading import Solid
 
-MOST = 40_000                        # triangles of a shape in the browser
+MOST = 40_000                        # triangles of a shape in the browser, which turns them smoothly
 
 
 def thin_solid(solid: Solid, most: int = MOST) -> Solid:
-    """The same with at most about so many triangles, each vertex coloured as the nearest one before."""
+    """Return a solid with at most about `most` triangles, each vertex coloured like the nearest original one."""
     mesh = solid.mesh
     if len(mesh.faces) <= most:
         return solid
     import fast_simplification
 
+    # about its middle, as the library works in single precision
     middle = mesh.vertices.mean(axis=0)
     points, faces = fast_simplification.simplify((mesh.vertices - middle).astype(np.float32),
                                                  mesh.faces.astype(np.int32), target_count=most)
@@ -27,19 +28,20 @@ def thin_solid(solid: Solid, most: int = MOST) -> Solid:
     nearest = cKDTree(mesh.vertices).query(points)[1]
     small = Mesh(points, faces.astype(np.int64), None if mesh.colors is None else mesh.colors[nearest])
 
-    def at(shade: np.ndarray | Heat) -> np.ndarray | Heat:
+    def transfer(shade: np.ndarray | Heat) -> np.ndarray | Heat:
+        """Transfer a colouring to the new vertices."""
         if isinstance(shade, Heat):
             return replace(shade, values=shade.values[nearest])
         values = np.asarray(shade)
         return values if values.ndim == 1 else of_vertices(values, mesh)[nearest]
 
     color = solid.color if solid.color is None or isinstance(solid.color, Heat) else np.asarray(solid.color)
-    return replace(solid, mesh=small, color=None if color is None else at(color),
-                   shades={name: at(shade) for name, shade in solid.shades.items()})
+    return replace(solid, mesh=small, color=None if color is None else transfer(color),
+                   shades={name: transfer(shade) for name, shade in solid.shades.items()})
 
 
 def of_vertices(colors: np.ndarray, mesh: Mesh) -> np.ndarray:
-    """Colours (N, 3) of vertices, of those of vertices or of triangles."""
+    """Return colours of vertices (N, 3) from those of vertices or of triangles."""
     if len(colors) != len(mesh.faces) or len(colors) == len(mesh.vertices):
         return colors
     out = np.zeros(mesh.vertices.shape, dtype=colors.dtype)

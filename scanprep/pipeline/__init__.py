@@ -1,1 +1,1 @@
-"""A folder of scans to a registered set: one scan after another or many at once, and the page of the set."""
+"""From a folder of scans to a registered set: one task per scan, and the page of the set."""

@@ -1,4 +1,4 @@
-"""What `scape prep run` was called with, kept in the set, so that the same can be done again from elsewhere."""
+"""The call of `scape prep run`, kept in the set, so that the same scans can be registered again."""
 from __future__ import annotations
 
 from collections.abc import Callable
@@ -13,12 +13,12 @@ from ..geometry.mesh import Mesh
 from .prepare import PrepareConfig
 from .scans import ScanTask, find_scans
 
-LISTED = 5                    # scans that a line names
+LISTED = 5                    # scans that one line names: more would not be read
 
 
 @dataclass(frozen=True)
 class Call(KeptCall):
-    """Scans, template and settings of a set; paths are absolute once they were read."""
+    """Scans, template and settings of a set; paths are absolute after reading."""
 
     command: ClassVar[str] = "scape prep run"
     scans: Path
@@ -29,23 +29,23 @@ class Call(KeptCall):
     config: PrepareConfig = field(default_factory=PrepareConfig)
 
     def tasks(self) -> list[ScanTask]:
-        """The scans as they are now."""
+        """Find the scans that are in the folder now."""
         return find_scans(self.scans, self.landmarks, self.subject)
 
-    def inputs(self, tell: Callable[[str], None]) -> tuple[list[ScanTask], Mesh, dict[str, int]]:
-        """Scans, template and its landmarks, as their files are now; told of scans without landmarks."""
-        body, tasks, through = read_mesh(self.template), self.tasks(), self.config.scan.through
+    def inputs(self, say: Callable[[str], None]) -> tuple[list[ScanTask], Mesh, dict[str, int]]:
+        """Read scans, template and its landmarks from their files; `say` gets a note about scans without landmarks."""
+        template, tasks, through = read_mesh(self.template), self.tasks(), self.config.scan.through
         without = [task.name for task in tasks if task.landmarks is None]
-        # the set keeps those of the template in any case: what is learned from it is measured by them
-        named = self.template_landmarks or landmarks_beside(self.template)
-        marks = read_template_landmarks(self.template, body, self.template_landmarks) if named else {}
+        # the set keeps the template's landmarks even if no scan has any: models learned from it measure bodies by them
+        file = self.template_landmarks or landmarks_beside(self.template)
+        landmarks = read_template_landmarks(self.template, template, self.template_landmarks) if file else {}
         if through == "pose":
-            tell("note: no landmarks are used; all scans must be near the template's pose")
+            say("note: no landmarks are used; all scans must be near the template's pose")
         elif len(without) == len(tasks):
-            tell("note: no landmarks are used; look at the page for scans turned round or mirrored")
-        else:                                          # some scan is led by landmarks
-            marks = marks or read_template_landmarks(self.template, body, self.template_landmarks)
+            say("note: no landmarks are used; look at the page for scans turned round or mirrored")
+        else:                                          # at least one scan has landmarks, so the template needs them
+            landmarks = landmarks or read_template_landmarks(self.template, template, self.template_landmarks)
             if without:
-                tell(f"note: no landmarks for {len(without)} of {len(tasks)} scans ({', '.join(without[:LISTED])}); "
+                say(f"note: no landmarks for {len(without)} of {len(tasks)} scans ({', '.join(without[:LISTED])}); "
                      "look at the page for those turned round or mirrored")
-        return tasks, body, marks
+        return tasks, template, landmarks

@@ -1,9 +1,9 @@
-"""A set teaches itself: doubted scans are registered again, through a model of the scans that are not doubted.
+"""Register doubted scans again, through a model learned from the good scans of the same set (bootstrapping).
 
-    scans --register--> good: learn a model of them --> doubted: register through it --better?--> good, and once more
+    scans --register--> good ones: learn a model --> doubted ones: register through it --better?--> good; repeat
 
-The model knows this body and how it moves, where the built-in people know people in general; and it is there for
-animals and hands too. Scans with landmarks are left as they are, and those for which somebody chose between two bodies.
+The model knows this body and its movement; the built-in people know only people in general. It also works for animals
+and hands. Scans with landmarks stay as they are, and so do those where the user chose between two bodies.
 """
 from __future__ import annotations
 
@@ -30,15 +30,15 @@ from .scan import RegisterScan, mesh_file
 from .scans import ScanTask
 
 Progress = Callable[[int, int], None]
-ROUNDS = 3                          # models that are learned at most; another one needs a scan that has become good
-CLEARLY = 0.8                       # of what was wrong with a scan, below which its next registration is better
-MOST = 40                           # poses that teach: learning takes a second a pose, and more hardly help a search
-MODEL = "set_model.npz"             # what the set taught, in the folder of the round
+ROUNDS = 3                          # at most; a further round needs a scan that has become good in the last one
+CLEARLY = 0.8                       # a registration counts as better below this share of the former badness
+MOST = 40                           # training poses at most: learning takes a second per pose, and more hardly help
+MODEL = "set_model.npz"             # file of the learned model, in the folder of the round
 
 
 @dataclass(frozen=True, eq=False)
 class DoubtedScan:
-    """A scan that is registered again, and how bad it was: the multiple of a limit; infinite where it failed."""
+    """A scan to register again, and its badness: how many times over a limit; infinite where it failed."""
 
     scan: ScanTask
     badness: float
@@ -46,25 +46,26 @@ class DoubtedScan:
 
 @dataclass(frozen=True, eq=False)
 class RegisterAgain:
-    """The work on each doubted scan: registered through the set's model, written where that is clearly better."""
+    """The work on each doubted scan: register it through the set's model, and write it if clearly better."""
 
     first: RegisterScan
     number: int                     # of the round, from 1
 
-    def __call__(self, given: DoubtedScan, room: TaskContext) -> ScanFigures | None:
+    def __call__(self, doubted: DoubtedScan, context: TaskContext) -> ScanFigures | None:
+        """Register a scan again; return its figures, or None where it is not clearly better."""
         try:
-            found = self.first.register(given.scan, room)
-        except ValueError:              # the model does not find it either: the first registration stays, or its reason
+            registered = self.first.register(doubted.scan, context)
+        except ValueError:              # the model fails too: the first registration, or its failure, stays
             return None
-        if not judge_alone(found.figures, self.first).badness < CLEARLY * given.badness:
+        if not judge_alone(registered.figures, self.first).badness < CLEARLY * doubted.badness:
             return None
-        self.first.write(room.folder / folder_of(self.number), given.scan.name, found)
-        return found.figures
+        self.first.write(context.folder / folder_of(self.number), doubted.scan.name, registered)
+        return registered.figures
 
 
 @dataclass(frozen=True, eq=False)
 class Lessons:
-    """What teaches a model: files of meshes of one subject in several poses, and one mesh of each of the others."""
+    """Training data of a model: mesh files of one subject in several poses, and one mesh of every other subject."""
 
     subject: str
     poses: tuple[Path, ...]
@@ -72,105 +73,111 @@ class Lessons:
 
 
 def folder_of(number: int) -> str:
-    """Where the meshes, pictures and model of a round are, inside the folder of the set."""
+    """Return the folder of a round inside the set: its meshes, pictures and model."""
     return f"again{number}"
 
 
 def judge_alone(figures: ScanFigures, work: RegisterScan) -> Verdict:
-    """The verdict on one scan, whatever is usual in its set."""
+    """Judge one scan by itself, without comparing it to the rest of its set."""
     doubts = None if work.parts is None else {figures.name: figures.doubts}
     return review([figures], {}, size(work.template), len(work.template.faces), doubts=doubts, usual=UNSEEN)[0]
 
 
 def find_better_scans(space: Workspace, work: RegisterScan) -> dict[str, tuple[ScanFigures, str]]:
-    """Scans whose later registration was better: their figures, and where the mesh is inside the set."""
-    found = {}
+    """Find scans whose later registration was better: name -> its figures and the path of its mesh in the set."""
+    better = {}
     for number in range(1, ROUNDS + 1):
         for figures in space.results(RegisterAgain(work, number)).values():
             if figures is not None:
-                found[figures.name] = figures, f"{folder_of(number)}/{mesh_file(figures.name)}"
-    return found
+                better[figures.name] = figures, f"{folder_of(number)}/{mesh_file(figures.name)}"
+    return better
 
 
 def drop_rounds(space: Workspace, name: str) -> None:
-    """Remove the later registrations of a scan."""
+    """Remove all later registrations of a scan."""
     for number in range(1, ROUNDS + 1):
         space.drop(f"{folder_of(number)}/{name}")
 
 
 def drop_round(space: Workspace, number: int, names: Collection[str]) -> None:
-    """Remove the registrations of some scans in a round, and its model when nothing else was made with it.
+    """Remove the registrations of some scans in a round, and its model if no other scan used it.
 
     Scans of earlier calls, which are not among the names, keep theirs.
     """
-    kept = f"{folder_of(number)}/"
+    prefix = f"{folder_of(number)}/"
     for name in names:
-        space.drop(kept + name)
-    if not space.list_results(kept):
+        space.drop(prefix + name)
+    if not space.list_results(prefix):
         space.drop(f"model {number}")
 
 
 def bootstrap_set(space: Workspace, work: RegisterScan, tasks: Sequence[ScanTask], first: Mapping[str, ScanFigures],
                   min_poses: int, skeleton: SkeletonConfig, workers: Workers, progress: Progress | None = None
                   ) -> set[str]:
-    """Register doubted scans without landmarks through models that the others teach, round by round.
+    """Register doubted scans without landmarks through models learned from the good ones, round by round.
 
     Parameters
     ----------
     space : Workspace
         The folder of the set.
     work : RegisterScan
-        How all were registered first.
-    tasks : scans of this call
-    first : name -> figures of the first registrations
-        Without those that failed.
+        How all scans were registered first.
+    tasks : sequence of ScanTask
+        The scans of this call.
+    first : mapping of str to ScanFigures
+        Figures of the first registrations by scan, without those that failed.
     min_poses : int
-        Good meshes of one subject that are needed.
+        How many good meshes of one subject a model needs.
     skeleton : SkeletonConfig
-        How parts are found on a template that is no person.
+        How parts are found on a template that is not a person.
     workers : Workers
+        Where the work runs.
     progress : callable, optional
         Called as progress(done, total) in every round.
 
     Returns
     -------
-    names of the scans that were registered again now
+    set of str
+        Names of the scans that were registered again in this run.
     """
     fresh = set[str]()
     best = {name: judge_alone(f, work) for name, f in first.items()}
     files = {name: mesh_file(name) for name in best}
     chosen = {name for name in best if is_chosen(space.folder, name)}
-    own = "of this set"  # what such a lead is called in figures: "model of this set"
+    lead_name = "of this set"  # appears in figures as "model of this set"
     for number in range(1, ROUNDS + 1):
-        kept = f"{folder_of(number)}/"
+        prefix = f"{folder_of(number)}/"
+        # doubted scans, and the good ones that can teach a model
         doubted = [task for task in tasks if task.landmarks is None and task.name not in chosen
                    and (task.name not in best or best[task.name].suspect)]
         lessons = choose_lessons(space.folder, tasks, best, files, min_poses)
-        if lessons is not None and not lessons.shapes:          # it knows the body of one subject alone
+        if lessons is not None and not lessons.shapes:          # without other shapes the model fits this subject only
             doubted = [task for task in doubted if task.subject == lessons.subject]
         if lessons is None or not doubted:
             drop_round(space, number, {task.name for task in tasks})
             continue
-        # a model of what is good; its file is in the folder of the round
-        place = Path(folder_of(number)) / MODEL
-        model = space.folder / place
-        teach = partial(_teach, place, work, skeleton, lessons)
+        # learn a model of the good scans; the lead is that model fitted to the template
+        model_file = Path(folder_of(number)) / MODEL
+        model = space.folder / model_file
+        teach = partial(_teach, model_file, work, skeleton, lessons)
         space.step(f"model {number}", (work.template, work.parts, skeleton, lessons), teach)
         lead = lead_of(work.template, str(model))
         assert lead is not None, "a model was named"
-        again = RegisterAgain(replace(work, lead=replace(lead, name=own)), number)      # type: ignore[type-var]
-        given = [DoubtedScan(replace(task, model=model), best[task.name].badness if task.name in best else np.inf)
+        again = RegisterAgain(replace(work, lead=replace(lead, name=lead_name)), number)      # type: ignore[type-var]
+        # register the doubted scans through it
+        inputs = [DoubtedScan(replace(task, model=model), best[task.name].badness if task.name in best else np.inf)
                  for task in doubted]
-        done = space.run(again, [Task(kept + one.scan.name, one) for one in given], workers, progress)
+        done = space.run(again, [Task(prefix + one.scan.name, one) for one in inputs], workers, progress)
         drop_round(space, number, {task.name for task in tasks} - {task.name for task in doubted})
-        fresh |= {name.removeprefix(kept) for name in done.fresh}
-        # what became better counts from now on
-        before = sum(not verdict.suspect for verdict in best.values())
+        fresh |= {name.removeprefix(prefix) for name in done.fresh}
+        # better registrations replace the earlier ones in the rounds to come
+        good_before = sum(not verdict.suspect for verdict in best.values())
         for figures in done.values.values():
             if figures is not None:
                 best[figures.name] = judge_alone(figures, work)
                 files[figures.name] = f"{folder_of(number)}/{mesh_file(figures.name)}"
-        if sum(not verdict.suspect for verdict in best.values()) == before:
+        # no scan has become good: further rounds would learn the same model
+        if sum(not verdict.suspect for verdict in best.values()) == good_before:
             for later in range(number + 1, ROUNDS + 1):
                 drop_round(space, later, {task.name for task in tasks})
             break
@@ -179,22 +186,26 @@ def bootstrap_set(space: Workspace, work: RegisterScan, tasks: Sequence[ScanTask
 
 def choose_lessons(folder: Path, tasks: Sequence[ScanTask], best: Mapping[str, Verdict], files: Mapping[str, str],
                    min_poses: int) -> Lessons | None:
-    """Good meshes of the subject with the most of them, and one of each other subject; None where they are too few."""
+    """Choose training meshes: good ones of the subject that has most, and one of each other subject.
+
+    None where the subject has fewer than `min_poses`.
+    """
     good = [task for task in tasks if task.name in best and not best[task.name].suspect]
     counts = Counter(task.subject for task in good)
     subject = max(counts, key=lambda name: counts[name], default="")
     if counts[subject] < min_poses:
         return None
     places = {task.name: folder / files[task.name] for task in good}
-    others = {task.subject: places[task.name] for task in good if task.subject != subject}
+    other_subjects = {task.subject: places[task.name] for task in good if task.subject != subject}
     return Lessons(subject, tuple(places[task.name] for task in good if task.subject == subject),
-                   tuple(others.values()) if len(others) > 1 else ())
+                   # a single other body does not span shape differences
+                   tuple(other_subjects.values()) if len(other_subjects) > 1 else ())
 
 
 def _teach(place: Path, work: RegisterScan, config: SkeletonConfig, lessons: Lessons, folder: Path) -> None:
-    """Write a model of meshes that are good, with the parts of a person, or those that the poses show."""
+    """Learn a model from good meshes and write it; parts are those of a person, or found from the poses."""
     poses = np.stack([read_mesh(file, unit="m").vertices for file in lessons.poses])
-    if len(poses) > MOST:           # those that differ most from one another
+    if len(poses) > MOST:           # keep those that differ most from each other
         poses = poses[farthest_points((poses - poses.mean(axis=1, keepdims=True)).reshape(len(poses), -1), MOST)]
     shapes = np.stack([read_mesh(file, unit="m").vertices for file in lessons.shapes]) if lessons.shapes else None
     skeleton = find_skeleton(work.template, poses, config) if work.parts is None else work.parts.skeleton

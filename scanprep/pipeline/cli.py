@@ -1,4 +1,4 @@
-"""`scape prep run` and `scape prep page`: a whole folder of scans."""
+"""`scape prep run` and `scape prep page`: register a whole folder of scans."""
 from __future__ import annotations
 
 from collections import Counter
@@ -49,40 +49,41 @@ def run_all(scans: ScansArg, template: Path, output: Output, landmarks: Path | N
     if clean and config.scan.clean is None:
         config = replace(config, scan=replace(config.scan, clean=CleanScanConfig()))
     if Path(config.scan.through).is_file():
-        # the set is mended from other places
+        # an absolute path, as the set may be corrected from another folder later
         config = replace(config, scan=replace(config.scan, through=str(Path(config.scan.through).absolute())))
     call = Call(scans, template, landmarks, template_landmarks, subject, config)
-    given = call.inputs(say)
+    inputs = call.inputs(say)
     with bar("finding the parts of a person") as naming, bar("registering scans") as registering, \
             bar("finding the skeleton") as finding:
-        return carry_out(call, given, space, registering, finding, naming)
+        return carry_out(call, inputs, space, registering, finding, naming)
 
 
-def carry_out(call: Call, given: tuple[list[ScanTask], Mesh, dict[str, int]], space: Workspace,
-                *tell: Progress) -> Outcome:
-    """Register what has changed of a folder in a set that is open, and keep there what was asked for.
+def carry_out(call: Call, inputs: tuple[list[ScanTask], Mesh, dict[str, int]], space: Workspace,
+                *progress: Progress) -> Outcome:
+    """Register the scans that have changed into an open set, and keep the call there.
 
-    `tell` is the progress of scans, the skeleton, the parts of a person, and inside a scan.
+    `progress` are up to four callbacks: scans, skeleton, parts of a person, and the steps inside one scan.
     """
-    tasks, body, marks = given
-    done = prepare(tasks, body, marks, space.folder, call.config, *tell)
+    tasks, template, landmarks = inputs
+    prepared = prepare(tasks, template, landmarks, space.folder, call.config, *progress)
     with space.staging("run") as staged:
         call.write(staged.folder)
-    return summarize(call, len(tasks), done, space)
+    return summarize(call, len(tasks), prepared, space)
 
 
-def summarize(call: Call, count: int, done: Prepared, space: Workspace) -> Outcome:
-    """What became of a number of scans in a set that is open."""
-    verdicts, tree = judge_set(space.folder), done.registered.skeleton
-    seconds = [f.seconds for f in done.figures if np.isfinite(f.seconds)]
-    ways = Counter(f.init.lstrip("0123456789 ") for f in done.figures)        # without the number of landmarks
-    rows = [Metric("scans registered", f"{count - len(done.failures)} of {count}"),
-            Metric("of them in this run", done.fresh),
+def summarize(call: Call, count: int, prepared: Prepared, space: Workspace) -> Outcome:
+    """Build the outcome of the command: figures of the set, failures, judgement and next step."""
+    verdicts, tree = judge_set(space.folder), prepared.registered.skeleton
+    seconds = [f.seconds for f in prepared.figures if np.isfinite(f.seconds)]
+    ways = Counter(f.init.lstrip("0123456789 ") for f in prepared.figures)     # without their number
+    # the closing table: how many, by which method, how fast, how good
+    rows = [Metric("scans registered", f"{count - len(prepared.failures)} of {count}"),
+            Metric("of them in this run", prepared.fresh),
             *(Metric(f"led by {way}", count) for way, count in sorted(ways.items())),
             Metric("time a scan, mean", float(np.mean(seconds)) if seconds else "", "s"),
             Metric("parts of the skeleton", len(tree.parents) if tree else "none sought"),
             *_quality(verdicts), Metric("unit assumed", call.config.scan.unit or "m")]
-    return Outcome(space.folder, rows, {"prepare": call.config}, list(done.failures),
+    return Outcome(space.folder, rows, {"prepare": call.config}, list(prepared.failures),
                    judgement=judge_whole(verdicts, tree),
                    following=f"open {space.folder / 'report.html'}, then "
                              f"scape learn --poses {space.folder} --shapes {space.folder} -o model.npz")
@@ -105,11 +106,12 @@ def page(registered: SetArg, limits: Limits = Limits()) -> Outcome:
 
 
 def _quality(verdicts: Sequence[Verdict]) -> list[Metric]:
-    """Means over the set, and the scans that need a look."""
+    """Return means over the set, and the scans that need a look."""
     suspects = [v for v in verdicts if v.suspect]
     figures = [v.figures for v in verdicts if v.figures is not None]
 
     def mean(name: str) -> float:
+        """Compute the mean of a figure over the scans that have it; NaN where none has."""
         values = np.array([getattr(f, name) for f in figures], dtype=float)
         return float(values[np.isfinite(values)].mean()) if np.isfinite(values).any() else np.nan
 

@@ -1,8 +1,8 @@
-"""`scape prep landmarks`: named landmarks for scans that nobody clicked, each with its expected error.
+"""`scape prep landmarks`: named landmarks for scans without clicked ones, each with its expected error.
 
-    OUTPUT/NAME.landmarks.json    of each scan, or in another format: the landmarks where it has data
-    OUTPUT/landmarks.csv          all landmarks of all scans, those without data too, with expected errors
-    OUTPUT/set/                   the template on every scan, as `scape prep run` makes it, with its page
+    OUTPUT/NAME.landmarks.json    of each scan, or in another format: the landmarks where the scan has data
+    OUTPUT/landmarks.csv          all landmarks of all scans, also those without data, with expected errors
+    OUTPUT/set/                   the template on every scan, as `scape prep run` writes it, with its page
 """
 from __future__ import annotations
 
@@ -37,13 +37,15 @@ from .prepare import PrepareConfig, prepare
 from .scan import ScanSettings
 from .scans import ScanTask, find_scans
 
+# folder of the registered set and file of the table, inside the output
 SET, TABLE = "set", "landmarks.csv"
-POINTS = "points/"               # before the names of the results that are landmarks of a scan
-# Names whose places end or bend sharply, so that the surface holds a landmark there; along other skin it slides.
+POINTS = "points/"               # prefix of the names under which landmarks of a scan are kept
+# Words in names of landmarks at tips and sharp bends: there the shape fixes a landmark; on smooth skin it slides.
 ENDS = {"toe", "heel", "finger", "thumb", "nose", "mouth", "chin", "eye", "ear", "neck"}
-# Metres, on a body of the size of a man. Two of three landmarks were within these on six men who are not the template;
-# joints and trunk were alike. And the share of the way to the nearest data by which errors grow, on poses from the
-# front. Both by tests/benchmarks/found_landmarks.py FOLDER --set tuning.
+# ERRORS: metres, on a body of the size of a man; on six men who are not the template, two of three landmarks were
+# nearer than this, at joints and trunk alike. MAN: size of that man, the root of his skin area, in metres.
+# ACROSS: errors grow by this share of the distance to the nearest data, measured on poses seen from the front.
+# Measured with tests/benchmarks/found_landmarks.py FOLDER --set tuning.
 ERRORS, MAN, ACROSS = {"end": 0.005, "skin": 0.026}, 1.4, 0.3
 COLUMNS = ("scan", "landmark", "x", "y", "z", "expected_error_mm", "data", "verdict")
 
@@ -58,9 +60,9 @@ class ScanLandmarks:
     points : (L, 3) float, metres
         On the scan where it has data, else on the template that was registered to it.
     gaps : (L,) float, metres
-        From the nearest place with data; 0 where the scan has data.
+        Distance to the nearest place with data; 0 where the scan has data.
     size : float, metres
-        Of the body, the root of its area.
+        Size of the body: the square root of its surface area.
     """
 
     names: tuple[str, ...]
@@ -70,7 +72,7 @@ class ScanLandmarks:
 
     @property
     def seen(self) -> np.ndarray:
-        """(L,) bool: the scan has data there."""
+        """(L,) bool: whether the scan has data at the landmark."""
         return self.gaps == 0
 
 
@@ -104,7 +106,7 @@ def landmark_scans(scans: ScansArg, output: Output, template: Path | None = None
 
 
 def template_and_landmarks(template: Path | None, space: Workspace, progress: Progress) -> tuple[Mesh, dict[str, int]]:
-    """A template and its named vertices: those of its file, then the built-in ones that it lacks, if it is a person.
+    """Read a template and its named vertices; a person also gets the built-in landmarks that its file lacks.
 
     Without a template it is the average of the built-in people. ValueError for one that has no landmarks.
     """
@@ -114,61 +116,62 @@ def template_and_landmarks(template: Path | None, space: Workspace, progress: Pr
     check_template(body)
     known = read_template_landmarks(template, body) if landmarks_beside(template) else {}
     named = translate_landmarks(known)
-    more = space.step("template", (body, known), lambda folder: find_landmarks(body, known, progress))
-    # names stay as they are spelt in the file
-    marks = known | {name: vertex for name, vertex in more.items() if name not in named}
-    if not marks:
+    built_in = space.step("template", (body, known), lambda folder: find_landmarks(body, known, progress))
+    # names keep the spelling of the file
+    landmarks = known | {name: vertex for name, vertex in built_in.items() if name not in named}
+    if not landmarks:
         raise ValueError(f"{template}: expected landmarks in {name_of(template)}.landmarks.json beside it, or the body "
                          "of a person; found neither: click them with scape pick, or leave out --template")
-    return body, marks
+    return body, landmarks
 
 
-def write_all(tasks: Sequence[ScanTask], template: Mesh, marks: Mapping[str, int], config: PrepareConfig,
-              format: Format, space: Workspace, *tell: Progress) -> Outcome:
-    """Register a template to scans, and write its landmarks as they lie on each, into an output that is open.
+def write_all(tasks: Sequence[ScanTask], template: Mesh, landmarks: Mapping[str, int], config: PrepareConfig,
+              format: Format, space: Workspace, *progress: Progress) -> Outcome:
+    """Register a template to scans, and write its landmarks on each scan into an open output.
 
-    What is done already is not done again. `tell` is the progress of scans, of parts of a person, and of files.
+    Finished scans are not computed again. `progress` are callbacks for scans, for parts of a person, and for files.
     """
-    registering, naming, writing = tell or (None, None, None)
-    # landmarks that somebody clicked are left out; nobody has so many poses, so that no skeleton is sought and no
-    # model of the set learned: landmarks of one scan do not depend on the others
+    registering, naming, writing = progress or (None, None, None)
+    # clicked landmarks are ignored. No subject has this many poses, so no skeleton is found and no model of the set is
+    # learned: the landmarks of one scan must not depend on the other scans
     tasks = [replace(task, landmarks=None) for task in tasks]
     config = replace(config, min_poses=10_000_000)
     place = space.folder / SET
+    # register the template to all scans, in a set inside the output
     with workspace(place, space.force) as set_space:
-        done = prepare(tasks, template, marks, place, config, registering, None, naming)
+        done = prepare(tasks, template, landmarks, place, config, registering, None, naming)
         verdicts = {verdict.name: verdict for verdict in judge_set(place)}
         failed = [task.name for task in tasks if verdicts[task.name].failed]
         if len(failed) == len(tasks) and set_space.is_new and space.is_new:
             raise NothingMadeError(done.failures)
 
-    # a scan that failed now may have a file of an earlier run
+    # a scan that failed now may have landmarks of an earlier run
     for name in failed:
         space.drop(POINTS + name)
-    work, meshes = FindPoints(dict(marks)), {entry.name: entry.file for entry in done.registered.entries}
-    found = space.run(work, [Task(POINTS + task.name, ScanAndBody(
+    work, meshes = FindPoints(dict(landmarks)), {entry.name: entry.file for entry in done.registered.entries}
+    located = space.run(work, [Task(POINTS + task.name, ScanAndBody(
         task.scan, place / meshes[task.name], task.name + landmark_ending(format), config.scan.unit))
         for task in tasks if task.name not in failed], config.workers, writing)
 
-    # the table has the scans of earlier calls too, as the set has
+    # like the set, the table also lists the scans of earlier calls
     words = {name: verdict.judgement.verdict for name, verdict in verdicts.items()}
-    kept = space.results(work)
-    every = {name: kept[POINTS + name] for name in words if POINTS + name in kept}
+    stored = space.results(work)
+    by_scan = {name: stored[POINTS + name] for name in words if POINTS + name in stored}
     with space.staging("table") as staged:
-        tables.write_table(staged.folder / TABLE, COLUMNS, list(landmark_rows(every, words)))
-    rows = [Metric("scans with landmarks", f"{len(found.values)} of {len(tasks)}"),
-            Metric("registered in this run", done.fresh), Metric("landmarks of each", len(marks)),
-            *error_rows({task.name: every[task.name] for task in tasks if task.name in every}, words),
+        tables.write_table(staged.folder / TABLE, COLUMNS, list(landmark_rows(by_scan, words)))
+    rows = [Metric("scans with landmarks", f"{len(located.values)} of {len(tasks)}"),
+            Metric("registered in this run", done.fresh), Metric("landmarks of each", len(landmarks)),
+            *error_rows({task.name: by_scan[task.name] for task in tasks if task.name in by_scan}, words),
             Metric("scans that need a look", sum(verdict.suspect for verdict in verdicts.values())),
             Metric("unit assumed", config.scan.unit or "m")]
-    return Outcome(space.folder, rows, {"prepare": config}, [*done.failures, *found.failures.values()],
+    return Outcome(space.folder, rows, {"prepare": config}, [*done.failures, *located.failures.values()],
                    judgement=judge_whole(list(verdicts.values()), None),
                    following=f"open {place / 'report.html'}: scans that need a look come first")
 
 
 @dataclass(frozen=True)
 class ScanAndBody:
-    """A scan, the template on it, the landmark file to write, and the unit of scan and file."""
+    """A scan, the registered template, the landmark file to write, and the unit of scan and file."""
 
     scan: Path
     mesh: Path
@@ -178,50 +181,52 @@ class ScanAndBody:
 
 @dataclass(frozen=True, eq=False)
 class FindPoints:
-    """The work on each scan that is registered: its landmark file, of these vertices of the template."""
+    """The work on each registered scan: find the landmarks on it and write them to a file."""
 
     landmarks: Mapping[str, int]
 
-    def __call__(self, given: ScanAndBody, room: TaskContext) -> ScanLandmarks:
-        scan, body = read_scan(given.scan, given.unit), read_mesh(given.mesh, unit="m")
+    def __call__(self, inputs: ScanAndBody, context: TaskContext) -> ScanLandmarks:
+        """Find the landmarks of one scan."""
+        scan, body = read_scan(inputs.scan, inputs.unit), read_mesh(inputs.mesh, unit="m")
         points, gaps = points_on_scan(scan, body, np.array(list(self.landmarks.values())))
-        found = ScanLandmarks(tuple(self.landmarks), points, gaps, size(body))
-        if found.seen.any():                                 # no reader takes a file without landmarks
-            write_landmarks(room.folder / given.file, {name: point for name, point, there in zip(
-                found.names, points, found.seen, strict=True) if there}, given.unit)
-        return found
+        landmarks = ScanLandmarks(tuple(self.landmarks), points, gaps, size(body))
+        if landmarks.seen.any():                                 # a file without landmarks could not be read again
+            write_landmarks(context.folder / inputs.file, {name: point for name, point, there in zip(
+                landmarks.names, points, landmarks.seen, strict=True) if there}, inputs.unit)
+        return landmarks
 
 
 def points_on_scan(scan: Mesh | np.ndarray, body: Mesh, vertices: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Where vertices of a body that lies on a scan are on the scan, and how far from data.
+    """Find where vertices of a registered body are on the scan, and how far each is from data.
 
     Parameters
     ----------
     scan : Mesh or (n, 3) float, metres
+        The raw scan.
     body : Mesh
         The template, registered to the scan.
     vertices : (L,) int
-        Of the body.
+        Vertices of the body.
 
     Returns
     -------
     points : (L, 3) float, metres
-        The nearest point of the scan; the body's vertex where there are no data.
+        The nearest point of the scan; the body's own vertex where the scan has no data.
     gaps : (L,) float, metres
-        To the nearest vertex of the body that has data: 0 for those that have some, infinite where none has.
+        Distance to the nearest vertex of the body with data: 0 where there is data, infinite if no vertex has any.
 
     Examples
     --------
-    >>> from scanprep.synthetic.people import Person
-    >>> body = Person().mesh
+    >>> from scanprep.synthetic.people import SyntheticPerson
+    >>> body = SyntheticPerson().mesh
     >>> points, gaps = points_on_scan(body, body, np.array([711, 4616]))
     >>> np.allclose(points, body.vertices[[711, 4616]]), gaps.tolist()
     (True, [0.0, 0.0])
     """
-    # the other side of a thin limb is near too: points count that face as the body does
+    # only points that face the same way as the body count: the far side of a thin limb is near too
     scale = size(body)
     target = orient_by_mesh(target_of(scan), body, NORMALS * scale)
-    # of the body's size: as far off, the scan has no data; `Registration.uncovered` has it
+    # beyond a hundredth of the body's size there is no data, as in `Registration.uncovered`
     match = OrientedPoints(target.points, target.normals, NORMALS * scale).match(
         body.vertices, body.vertex_normals, 0.01 * scale)
     seen, points = match.valid[vertices], body.vertices[vertices]
@@ -229,6 +234,7 @@ def points_on_scan(scan: Mesh | np.ndarray, body: Mesh, vertices: np.ndarray) ->
     if match.valid.any():
         gaps[~seen] = cKDTree(body.vertices[match.valid]).query(points[~seen])[0]
     if isinstance(scan, Mesh) and len(scan.faces):
+        # a mesh gives the exact nearest place, a point cloud its nearest point
         points[seen] = Surface(scan).closest(points[seen]).points
     else:
         points[seen] = target.points[match.index[vertices][seen]]
@@ -236,7 +242,7 @@ def points_on_scan(scan: Mesh | np.ndarray, body: Mesh, vertices: np.ndarray) ->
 
 
 def place_of(name: str) -> str:
-    """Of what kind the place of a landmark is: "end" or "skin"; that of an unknown name is skin.
+    """Return whether a landmark is at an "end" of the body or on smooth "skin"; an unknown name is on skin.
 
     Examples
     --------
@@ -246,35 +252,35 @@ def place_of(name: str) -> str:
     return "end" if set(landmark_name(name).split()) & ENDS else "skin"
 
 
-def landmark_errors(found: ScanLandmarks, verdict: str) -> np.ndarray:
-    """How far off each landmark may be, (L,) metres, mostly along the skin: two of three are nearer.
+def landmark_errors(landmarks: ScanLandmarks, verdict: str) -> np.ndarray:
+    """Compute the expected error of each landmark, (L,) metres, mostly along the skin: two of three are nearer.
 
-    Off is from where the template's landmark belongs on that body. Somebody who clicks has an own idea of that, so from
-    clicks it is farther. `verdict` is that on the scan: "good" or "check".
+    The error is relative to where the template's landmark belongs on that body. People who click disagree about
+    that place, so distances to clicks are larger. `verdict` is the one on the scan: "good" or "check".
     """
-    # an end without data is not held by its shape: hands seen from the front came out short
-    places = np.where(found.seen, [place_of(name) for name in found.names], "skin")
-    errors = np.array([ERRORS[place] for place in places]) * found.size / MAN + ACROSS * found.gaps
-    # on a scan to be looked at, where a limb or the head may be elsewhere
+    # without data an end is not fixed by shape either: hands seen from the front came out short
+    places = np.where(landmarks.seen, [place_of(name) for name in landmarks.names], "skin")
+    errors = np.array([ERRORS[place] for place in places]) * landmarks.size / MAN + ACROSS * landmarks.gaps
+    # a doubtful registration may have a limb or the head in the wrong place
     return errors * (2.0 if verdict == "check" else 1.0)
 
 
-def landmark_rows(found: Mapping[str, ScanLandmarks], verdicts: Mapping[str, str]) -> Iterator[tuple[object, ...]]:
-    """The lines of the table of all landmarks, metres, by the names of their scans."""
-    for scan in sorted(found):
-        one = found[scan]
-        errors = MM * landmark_errors(one, verdicts[scan])
-        for name, point, error, seen in zip(one.names, one.points, errors, one.seen, strict=True):
+def landmark_rows(by_scan: Mapping[str, ScanLandmarks], verdicts: Mapping[str, str]) -> Iterator[tuple[object, ...]]:
+    """Yield the rows of the table of all landmarks, metres, sorted by scan."""
+    for scan in sorted(by_scan):
+        landmarks = by_scan[scan]
+        errors = MM * landmark_errors(landmarks, verdicts[scan])
+        for name, point, error, seen in zip(landmarks.names, landmarks.points, errors, landmarks.seen, strict=True):
             yield (scan, name, *(f"{value:.6f}" for value in point), f"{error:.0f}", "seen" if seen else "guessed",
                    verdicts[scan])
 
 
-def error_rows(found: Mapping[str, ScanLandmarks], verdicts: Mapping[str, str]) -> list[Metric]:
-    """The rows of the closing table on data and expected errors, over the landmarks of some scans."""
-    if not found:
+def error_rows(by_scan: Mapping[str, ScanLandmarks], verdicts: Mapping[str, str]) -> list[Metric]:
+    """Return the rows of the closing table about data and expected errors."""
+    if not by_scan:
         return []
-    errors = np.concatenate([MM * landmark_errors(one, verdicts[name]) for name, one in found.items()])
-    seen = np.concatenate([one.seen for one in found.values()])
+    errors = np.concatenate([MM * landmark_errors(landmarks, verdicts[name]) for name, landmarks in by_scan.items()])
+    seen = np.concatenate([landmarks.seen for landmarks in by_scan.values()])
     return [Metric("landmarks with data", 100 * float(seen.mean()), "%"),
             Metric("expected error, mean of those", float(errors[seen].mean()) if seen.any() else np.nan, "mm"),
             Metric("expected error, mean of guesses", float(errors[~seen].mean()) if not seen.all() else np.nan, "mm")]

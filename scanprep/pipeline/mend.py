@@ -1,6 +1,6 @@
-"""`scape pick SET`: the scans of a registered set worst first; their landmarks are mended, and they registered again.
+"""`scape pick SET`: the scans of a registered set, worst first, to correct landmarks and register again.
 
-Built on the clicking of landmarks: a third pane shows the template as it lies on the scan.
+It extends the clicking of landmarks by a third pane with the template as it lies on the scan.
 """
 from __future__ import annotations
 
@@ -34,9 +34,12 @@ class MendApp(ResultsApp):
 
     Parameters
     ----------
-    folder : of the set
-    ending : of new landmark files
-    names : offered beside those that are there already
+    folder : Path
+        Folder of the set.
+    ending : str
+        Ending of new landmark files.
+    names : tuple of str
+        Landmark names to offer beside those that are there already.
     """
 
     name, title = "mend", "Mend a set"
@@ -49,6 +52,7 @@ class MendApp(ResultsApp):
                              "there are no landmarks to mend")
         self.show_results(self.read_results())
         tasks = {task.name: task for task in self.call.tasks()}
+        # worst first; scans without a result come last
         worst = [name for name in self.verdicts if name in tasks]
         self.scan_names = [*worst, *(name for name in tasks if name not in self.verdicts)]
         self.changed: set[int] = set()
@@ -56,7 +60,7 @@ class MendApp(ResultsApp):
         super().__init__(template, [self._load_clicked(tasks[name], ending) for name in self.scan_names], names)
 
     def _load_clicked(self, task: ScanTask, ending: str) -> Clicked:
-        """A scan and its landmarks, in the file that `scape prep run` reads."""
+        """Load a scan and its landmarks from the file that `scape prep run` reads."""
         unit = self.call.config.scan.unit
         if task.landmarks is not None:
             return Clicked.load(task.scan, ending, unit, task.landmarks)
@@ -65,7 +69,7 @@ class MendApp(ResultsApp):
     # what the page is sent
 
     def scene(self) -> Message:
-        """Template, scan, and behind them, packed as the page of the set has it, the template on the scan."""
+        """Return template and scan, and behind them the packed scene of the registered template."""
         plain = super().scene()
         name = self.scan_names[self.current]
         entries = {entry.name: entry for entry in RegisteredSet.load(self.folder).entries}
@@ -74,14 +78,14 @@ class MendApp(ResultsApp):
                        plain.data + (shown.read_bytes() if shown.is_file() else b""))
 
     def judgements(self) -> Iterable[Judgement | None]:
-        """Of the scans; the path of one that is shown need not be said."""
+        """Yield the judgement on every scan, without the path, which the page shows anyway."""
         for name, one in zip(self.scan_names, self.scans, strict=True):
             verdict = self.verdicts.get(name)
             yield None if verdict is None else Judgement(verdict.judgement.verdict, tuple(
                 reason.removeprefix(f"{one.path}: ") for reason in verdict.judgement.reasons))
 
     def more(self) -> dict[str, Any]:
-        """Which scans have been changed, besides, and which have another body to choose."""
+        """Add to the state which scans have changed, and which have a second body to choose from."""
         return {**super().more(), "changed": [self.scan_names[i] for i in sorted(self.changed) if i >= 0],
                 "template_changed": -1 in self.changed, "set": str(self.folder),
                 "rivals": [name in self.rivals for name in self.scan_names]}
@@ -93,29 +97,31 @@ class MendApp(ResultsApp):
         self.changed.add(number)
 
     def on_register(self, send: Send) -> None:
-        """Register again what has changed."""
+        """Register the changed scans again."""
         if self.working is not None:
             return
-        before, self.changed = self.changed, set()
+        changed, self.changed = self.changed, set()
 
-        def telling(what: str) -> Progress:
-            def tell(done: int, total: int) -> None:
+        def show_progress(what: str) -> Progress:
+            """Return a progress callback that shows one stage on the page."""
+            def report_progress(done: int, total: int) -> None:
                 self.working = (what, done, total)
                 send(self.state())
-            return tell
+            return report_progress
 
-        work = ("registering", "finding the skeleton", "finding the parts of a person", "registering the scan")
+        stages = ("registering", "finding the skeleton", "finding the parts of a person", "registering the scan")
         def do(space: Workspace, _: Progress) -> tuple[Outcome, str]:
-            given = self.call.inputs(lambda line: None)
-            outcome = carry_out(self.call, given, space, *map(telling, work))
-            fresh = next(metric.value for metric in outcome.metrics if metric.name == "of them in this run")
-            return outcome, f"{fresh} of {len(given[0])} scans registered again; the page of the set is new"
+            inputs = self.call.inputs(lambda line: None)
+            outcome = carry_out(self.call, inputs, space, *map(show_progress, stages))
+            # how many were registered stands in the closing table
+            count = next(metric.value for metric in outcome.metrics if metric.name == "of them in this run")
+            return outcome, f"{count} of {len(inputs[0])} scans registered again; the page of the set is new"
 
-        self.do_again(work[0], f"scape pick {self.folder}", do, send, "nothing was registered",
-                      lambda: self.changed.update(before))
+        self.do_again(stages[0], f"scape pick {self.folder}", do, send, "nothing was registered",
+                      lambda: self.changed.update(changed))
 
     def on_take_rival(self, send: Send) -> None:
-        """Take the other body that explains the scan that is shown; once more takes it back."""
+        """Swap the shown scan's registration with its second body; doing it again swaps them back."""
         if self.working is not None:
             return
         name = self.scan_names[self.current]
@@ -128,13 +134,13 @@ class MendApp(ResultsApp):
         self.do_again("taking the other body", f"scape pick {self.folder}", do, send, "the body stays as it was")
 
     def read_results(self) -> dict[str, Verdict]:
-        """The verdicts on the scans of the set, worst first."""
+        """Read the verdicts on the scans of the set, worst first."""
         return {verdict.name: verdict for verdict in judge_set(self.folder)}
 
     def show_results(self, results: dict[str, Verdict]) -> None:
-        """The scans keep their order."""
+        """Show new verdicts; the scans keep their order."""
         self.verdicts = results
-        # beside the mesh in the folder of a later round, too; only a scan that had been registered first can be kept so
+        # the second body lies in the folder of the round that made it; a choice needs the first registration too
         self.rivals = {entry.name for entry in RegisteredSet.load(self.folder).entries
                        if has_rival((self.folder / entry.file).parents[1], entry.name)
                        and (self.folder / mesh_file(entry.name)).is_file()}

@@ -1,4 +1,4 @@
-"""The page of a registered set: every scan with its pictures and figures, worst first; and these pictures."""
+"""The page of a registered set: every scan with pictures and figures, worst first; and how the pictures are made."""
 from __future__ import annotations
 
 from collections.abc import Sequence
@@ -36,74 +36,77 @@ from ..skeleton.tree import Skeleton
 from ..words import number_of
 from .rivals import RIVALS, doubt_rival
 
-PICTURES, PAGE = "pictures", "report.html"
-WIDTH, HEIGHT = 150, 216
-MOST_CARRIED = 4_000_000    # bytes of pictures in the page itself, of the worst scans; the others stay files beside it
-FAR = 0.005                 # of the template's size: the dark end of the distances
-TURN = 20.0                 # degrees from the front
+PICTURES, PAGE = "pictures", "report.html"     # folder and file inside the set
+WIDTH, HEIGHT = 150, 216    # pixels of one picture: five side by side fit on the page, of a standing person
+MOST_CARRIED = 4_000_000    # bytes of pictures inside the page, worst scans first; the rest stay files beside it
+FAR = 0.005                 # share of the template's size at the dark end of the distance colours, 7 mm on a person
+TURN = 20.0                 # degrees from the front: shows depth, and the face
 
+# titles of the pictures in a strip, in the order of `pictures_of`
 PANELS = ("the scan", "the template on it", "distance, front", "distance, back", "dark: not sure")
 
 
 def write_set_page(folder: str | Path, limits: Limits | None = None, to: Path | None = None) -> Path:
-    """Write `report.html` of a set, from what lies in its folder, there or into another folder; returns its path."""
+    """Write `report.html` of a set from the files in its folder, there or into another folder; return its path."""
     folder, limits = Path(folder), limits or Limits()
-    whole, verdicts = RegisteredSet.load(folder), judge_set(folder, limits)
-    size = size_of(whole.template)
-    entries = {entry.name: entry for entry in whole.entries}
+    registered, verdicts = RegisteredSet.load(folder), judge_set(folder, limits)
+    size = size_of(registered.template)
+    entries = {entry.name: entry for entry in registered.entries}
+    # head of the page: how many scans need a look, the verdict, and figures over all scans
     failed = sum(v.failed for v in verdicts)
     suspect = sum(v.suspect and not v.failed for v in verdicts)
     parts = [f"{failed} could not be registered"] * bool(failed) + [f"{suspect} need a look"] * bool(suspect)
     page = Page(f"Scans of {folder.absolute().name}",
                 f"{number_of(len(verdicts), 'scan')}: {', '.join(parts) or 'all within their limits'}.")
-    page.verdict(judge_whole(verdicts, whole.skeleton, limits))
+    page.verdict(judge_whole(verdicts, registered.skeleton, limits))
     page.markup("", Path(__file__).with_name("page.css").read_text(encoding="utf-8"))
     page.table(_summary(verdicts), ("", "median", "worst", "unit"))
     page.section("Subjects", "Every scan, by subject: green is fine, amber needs a look, red could not be registered.")
     page.markup(_index(verdicts, entries))
     page.section("Worst first", _explanation(limits, size))
     page.picture(color_bar(0, FAR * size, "distance to the scan; grey: no data there"))
+    # pictures and scenes of the worst scans are carried by the page, as far as its size allows
     shots = [folder / pictures_place(entries.get(verdict.name)) / verdict.name for verdict in verdicts]
     scenes = worst_that_turn([shot.with_name(f"{shot.name}.scene") for shot in shots])
     pictures = embed_files((shot.with_name(f"{shot.name}.webp") for shot in shots), MOST_CARRIED)
-    # scans that turn where fewer need a look
+    # every scan that needs a look can be turned, and at least six
     look = max(6, sum(verdict.suspect or verdict.failed for verdict in verdicts))
     for number, (verdict, scene, picture) in enumerate(zip(verdicts, scenes, pictures, strict=True)):
         entry = entries.get(verdict.name)
-        shown = _scan_view(page, folder, pictures_place(entry), verdict.name, picture, scene if number < look else None)
+        view = _scan_view(page, folder, pictures_place(entry), verdict.name, picture, scene if number < look else None)
         rival = _scan_view(page, folder, pictures_place(entry).with_name(RIVALS), verdict.name, None, None)
-        page.markup(_card(verdict, entry, shown, rival))
-    if whole.skeleton is not None:
-        page.section("Skeleton", f"{len(whole.skeleton.parents)} parts: {', '.join(whole.skeleton.names)}.")
-        page.bodies([Pane([Solid(whole.template, part_colors(whole.skeleton.part_of_face))],
-                          look_around(whole.template, turns=(TURN,))[0])], "parts")
+        page.markup(_card(verdict, entry, view, rival))
+    if registered.skeleton is not None:
+        page.section("Skeleton", f"{len(registered.skeleton.parents)} parts: {', '.join(registered.skeleton.names)}.")
+        page.bodies([Pane([Solid(registered.template, part_colors(registered.skeleton.part_of_face))],
+                          look_around(registered.template, turns=(TURN,))[0])], "parts")
     page.write((to or folder) / PAGE)
     return (to or folder) / PAGE
 
 
 def pictures_place(entry: SetEntry | None) -> Path:
-    """The folder of a scan's pictures inside the set: beside that of its mesh."""
+    """Return the folder of a scan's pictures inside the set: beside the folder of its mesh."""
     return Path(PICTURES) if entry is None else Path(entry.file).parent.parent / PICTURES
 
 
 def judge_set(folder: str | Path, limits: Limits | None = None) -> list[Verdict]:
-    """The verdicts on all scans of a set, worst first."""
+    """Judge all scans of a set; return the verdicts, worst first."""
     folder = Path(folder)
     whole = RegisteredSet.load(folder)
     figures = [f for f in read_figures(folder) if f.name in whole.names]
     verdicts = review(figures, read_failures(folder), size_of(whole.template), len(whole.template.faces), limits,
                       read_doubts(folder))
-    # of two bodies that explain a scan as well somebody is to choose
+    # where two bodies explain a scan equally well, the user has to choose
     places = {entry.name: (folder / entry.file).parents[1] for entry in whole.entries}
     verdicts = [doubt_rival(verdict, places.get(verdict.name, folder)) for verdict in verdicts]
     return sorted(verdicts, key=lambda verdict: (-verdict.badness, verdict.name))
 
 
 def judge_whole(verdicts: Sequence[Verdict], skeleton: Skeleton | None, limits: Limits | None = None) -> Judgement:
-    """What a set is worth: its scans, whether most of what lies on them has data, and joints that a person lacks.
+    """Judge a set: its scans, whether most of the surface has data, and joints that a person should have.
 
-    No scan is blamed for what all lack. Of twenty real people seen from the front 16 are good by themselves, though a
-    limb of every second man is more than 45 mm off, where nothing was seen.
+    A gap that all scans share is no fault of one scan. Of twenty real people seen from the front 16 are good one by
+    one, though in every second man one limb, unseen, is more than 45 mm off.
     """
     unseen = [1 - verdict.figures.seen for verdict in verdicts if verdict.figures is not None]
     usual, most = float(np.median(unseen)) if unseen else 0.0, UNSEEN + (limits or Limits()).unseen
@@ -114,20 +117,22 @@ def judge_whole(verdicts: Sequence[Verdict], skeleton: Skeleton | None, limits: 
 
 
 def _summary(verdicts: Sequence[Verdict]) -> list[tuple[str, float, float, str]]:
+    """Return rows of median and worst value of each figure over the registered scans."""
     known = [v.figures for v in verdicts if v.figures is not None and not v.failed]
     rows = (("distance to the scan, mean", 1000, "distance", "mm", max), ("vertices with data", 100, "seen", "%", min),
             ("scan off the template", 100, "missed", "%", max), ("stretched or shrunk", 100, "stretch", "%", max),
             ("inverted triangles", 1, "inverted", "", max), ("landmarks off, RMS", 1000, "landmarks", "mm", max))
-    out = []
+    table = []
     for text, scale, name, unit, worst in rows:
         values = [scale * float(getattr(f, name)) for f in known]
         values = [value for value in values if np.isfinite(value)]
         if values:
-            out.append((text, float(np.median(values)), worst(values), unit))
-    return out
+            table.append((text, float(np.median(values)), worst(values), unit))
+    return table
 
 
 def _explanation(limits: Limits, size: float) -> str:
+    """Return the text that explains the limits."""
     return (
         "Scans that could not be registered come first, then the others by the figure that is furthest over its "
         "limit: that multiple is the number beside the name, and from 1 on a scan needs a look. The limits: "
@@ -146,6 +151,7 @@ def _explanation(limits: Limits, size: float) -> str:
 
 
 def _index(verdicts: Sequence[Verdict], entries: dict[str, SetEntry]) -> str:
+    """Return HTML with a link to every scan, grouped by subject."""
     groups: dict[str, list[tuple[str, Verdict]]] = {}
     for verdict in sorted(verdicts, key=lambda v: v.name):
         entry = entries.get(verdict.name)
@@ -155,12 +161,14 @@ def _index(verdicts: Sequence[Verdict], entries: dict[str, SetEntry]) -> str:
     for subject, members in sorted(groups.items()):
         links = "".join(f'<a href="#{_anchor(v)}" title="{escape(v.name)}"><span class="dot {_mark(v)}"></span>'
                         f"{escape(pose or v.name)}</a>" for pose, v in members)
+        # a subject with one scan of the same name needs no heading
         alone = len(members) == 1 and members[0][1].name == subject
         parts.append(f"<span>{'' if alone else f'<b>{escape(subject)}</b>'}{links}</span>")
     return f'<div class="index">{"".join(parts)}</div>'
 
 
 def _card(verdict: Verdict, entry: SetEntry | None, shown: str, rival: str) -> str:
+    """Return HTML of one scan: its figures, reasons and pictures."""
     f, table = verdict.figures, ""
     about = " · ".join(filter(None, [entry.subject if entry and entry.subject != verdict.name else "",
                                      entry.pose if entry else "", f.init if f else ""]))
@@ -168,6 +176,7 @@ def _card(verdict: Verdict, entry: SetEntry | None, shown: str, rival: str) -> s
     reasons = "".join(f"<li>{escape(reason)}</li>" for reason in verdict.reasons)
     if f:
         about += f" · {100 * f.removed:.0f}% of the points cleaned off" if f.removed else ""
+        # the table of figures
         rows = (("distance, mean", f"{1000 * f.distance:.2f} mm"), ("distance, RMS", f"{1000 * f.rms:.2f} mm"),
                 ("with data", f"{100 * f.seen:.0f}%"), ("confidence, mean", f"{f.confidence:.2f}"),
                 ("scan off the template", f"{100 * f.missed:.1f}%"),
@@ -185,7 +194,7 @@ def _card(verdict: Verdict, entry: SetEntry | None, shown: str, rival: str) -> s
 
 
 def _scan_view(page: Page, folder: Path, place: Path, name: str, picture: bytes | None, scene: bytes | None) -> str:
-    """A scan that turns, or its picture: the page carries that, or finds it in the folder when it is scrolled to."""
+    """Return HTML of a scan that turns, or of its picture, which is inside the page or a file beside it."""
     if picture is not None and scene is not None:
         return page.turning(scene, picture, height=300)
     if picture is None and not (folder / place / f"{name}.webp").exists():
@@ -198,48 +207,53 @@ def _scan_view(page: Page, folder: Path, place: Path, name: str, picture: bytes 
 
 
 def _mark(verdict: Verdict) -> str:
+    """Return the CSS class of a verdict."""
     return "failed" if verdict.failed else "look" if verdict.suspect else "fine"
 
 
 def _anchor(verdict: Verdict) -> str:
+    """Return the HTML id of a scan."""
     return "scan-" + escape(verdict.name.replace(" ", "_"))
 
 
 def pictures_of(template: Mesh, scan: Mesh | np.ndarray, fit: Registration) -> tuple[bytes, bytes]:
-    """One row of pictures as a WebP file, in the order of `PANELS`, and the same as a packed scene.
+    """Draw a registered scan: a strip of pictures as WebP, in the order of `PANELS`, and a packed scene.
 
     All are seen as the template would be from its front, whichever way the person stood in the scanner.
     """
+    # turn the body back into the template's orientation
     R, _ = rotations.procrustes(fit.mesh.vertices, template.vertices)
     middle = fit.mesh.vertices.mean(axis=0)
     body = fit.mesh.with_vertices((fit.mesh.vertices - middle) @ R.T)
-    near, back = (replace(c, width=1.06 * c.width, height=1.06 * c.height)
+    front, back = (replace(c, width=1.06 * c.width, height=1.06 * c.height)
                   for c in look_around(template, body.vertices, (TURN, TURN + 180)))
-    # the scan in the frame of the picture, with no more detail than a small picture can show
+    # the scan, turned like the body, with only as much detail as a small picture shows
     size, ball = size_of(template), 0.013 * size_of(template)
-    given: Solid | Dots
+    raw: Solid | Dots
     if isinstance(scan, Mesh) and len(scan.faces):
         coarse = cluster_vertices(scan, 0.007 * size)
-        given = Solid(coarse.with_vertices((coarse.vertices - middle) @ R.T))
+        raw = Solid(coarse.with_vertices((coarse.vertices - middle) @ R.T))
     else:
         points = scan.vertices if isinstance(scan, Mesh) else scan
-        given = Dots((points[thin(points, 1.25 * ball)] - middle) @ R.T, CLAY, ball)
+        raw = Dots((points[thin(points, 1.25 * ball)] - middle) @ R.T, CLAY, ball)
     far = Heat(smooth_values(body, fit.distances), 0, FAR * size, "distance to the scan")
-    sure = Heat(1 - fit.confidence, -0.35, 1, colormap="Blues")                     # unlike the distances
+    sure = Heat(1 - fit.confidence, -0.35, 1, colormap="Blues")     # not the colours of the distances
     shown: list[tuple[Shape, Camera]] = [
-        (given, near), (Solid(body, CLAY), near), (Solid(body, far), near), (Solid(body, far), back),
-        (Solid(body, sure), near)]
+        (raw, front), (Solid(body, CLAY), front), (Solid(body, far), front), (Solid(body, far), back),
+        (Solid(body, sure), front)]
     strip = webp_bytes(np.concatenate([render(shape, camera, WIDTH, HEIGHT) for shape, camera in shown], axis=1))
+    # for the browser: the body in several colourings, the scan over it hidden at first
     registered = Solid(body, far, name="registered template", shades={
         "confidence": Heat(fit.confidence, 0, 1, "confidence", "%", "Blues_r"), "plain": np.array(CLAY)})
-    over = replace(given, name="scan over it", visible=False)
-    return strip, small_scene([Pane([given], near, "scan"), Pane([registered, over], near, "the template on it")])
+    over = replace(raw, name="scan over it", visible=False)
+    return strip, small_scene([Pane([raw], front, "scan"), Pane([registered, over], front, "the template on it")])
 
 
 def smooth_values(mesh: Mesh, values: np.ndarray) -> np.ndarray:
-    """Values (N,) averaged with those of neighbours, so that noise fades and misfit stays; NaN stays NaN."""
+    """Average values (N,) with those of neighbours, so that noise fades and misfit stays; NaN stays NaN."""
     known = np.isfinite(values)
     weights = mesh.vertex_adjacency.astype(float) + eye_array(len(values))
+    # two rounds reach the second ring of neighbours
     for _ in range(2):
         total = weights @ np.where(known, values, 0.0)
         values = np.where(known, total / np.maximum(weights @ known.astype(float), 1.0), np.nan)
@@ -247,10 +261,11 @@ def smooth_values(mesh: Mesh, values: np.ndarray) -> np.ndarray:
 
 
 def cluster_vertices(mesh: Mesh, cell: float) -> Mesh:
-    """The mesh with all vertices of a cubic cell (metres) in one; for pictures only, it may not be manifold."""
+    """Merge the vertices inside each cubic cell (metres); for pictures only, as it may not be manifold."""
     key = np.floor((mesh.vertices - mesh.vertices.min(axis=0)) / cell).astype(np.int64)
     _, first, place = np.unique(key, axis=0, return_index=True, return_inverse=True)
     faces = place.reshape(-1)[mesh.faces]
+    # triangles inside one cell have collapsed
     apart = (faces[:, 0] != faces[:, 1]) & (faces[:, 1] != faces[:, 2]) & (faces[:, 2] != faces[:, 0])
     count = np.bincount(place.reshape(-1))
     means = np.stack([np.bincount(place.reshape(-1), axis) / count for axis in mesh.vertices.T], axis=1)

@@ -1,4 +1,4 @@
-"""`scape pick`: landmarks clicked in the browser."""
+"""`scape pick`: click landmarks in the browser."""
 from __future__ import annotations
 
 from dataclasses import replace
@@ -42,7 +42,7 @@ def pick_landmarks(mesh: MeshArg, scans: ScansArg = (), names: str = "ten", form
     ending = landmark_ending(format)
     if (mesh / "set.json").exists():
         return _run_mending(mesh, scans, ending, names, unit, serve)
-    template = Clicked.load(mesh, ending, None if scans else unit)      # as scape prep run reads it
+    template = Clicked.load(mesh, ending, None if scans else unit)      # in the unit in which scape prep run reads it
     others = [Clicked.load(path, ending, unit, file) for path, file in _files(scans)]
     with bar("reading") as progress:                      # a file that is no mesh is refused before a browser opens
         for number, one in enumerate(first := [template, *others[:1]]):
@@ -54,7 +54,7 @@ def pick_landmarks(mesh: MeshArg, scans: ScansArg = (), names: str = "ten", form
 
 def _run_mending(folder: Path, scans: tuple[Path, ...], ending: str, names: str, unit: Unit | None, serve: Port | None
                  ) -> Outcome:
-    """The same for the scans of a set, which are registered again there."""
+    """Correct landmarks of a registered set, whose scans are registered again."""
     from .mend import MendApp
 
     if scans or unit:
@@ -67,21 +67,21 @@ def _run_mending(folder: Path, scans: tuple[Path, ...], ending: str, names: str,
 
 
 def _serve_until_closed(app: PickApp, serve: Port | None) -> Outcome:
-    """An app in the browser until it is ended, and what was clicked."""
+    """Show an app in the browser until it is closed; return how many landmarks were clicked."""
     from ..viewer.server import serve as show
 
     all_bodies = (app.template, *app.scans)
-    before = {one.path: len(one.places) for one in all_bodies}
+    before = {body.path: len(body.places) for body in all_bodies}
     show(app, serve or None, serve is None)
-    done = [one for one in all_bodies if one.places]
-    return Outcome(None, [Metric("bodies with landmarks", len(done)),
-                          Metric("landmarks", sum(len(one.places) for one in done)),
-                          Metric("more than before", sum(len(one.places) - before[one.path] for one in done)),
-                          *(Metric(one.path.name, len(one.places), f"in {one.file.name}") for one in done)],
+    clicked = [body for body in all_bodies if body.places]
+    return Outcome(None, [Metric("bodies with landmarks", len(clicked)),
+                          Metric("landmarks", sum(len(body.places) for body in clicked)),
+                          Metric("more than before", sum(len(body.places) - before[body.path] for body in clicked)),
+                          *(Metric(body.path.name, len(body.places), f"in {body.file.name}") for body in clicked)],
                    judgement=None)
 
 
 def _files(scans: tuple[Path, ...]) -> list[tuple[Path, Path | None]]:
-    """Scans, and those of folders, with their landmark files where they are not beside them."""
+    """Return scans, and those in folders, with their landmark files where these are not beside the scan."""
     return [pair for one in scans for pair in (
         [(task.scan, task.landmarks) for task in find_scans(one)] if one.is_dir() else [(one, None)])]

@@ -1,4 +1,4 @@
-"""A folder of scans to a registered set: one task a scan, resumable, and one bad scan stops no other.
+"""From a folder of scans to a registered set: one task per scan, resumable; one bad scan stops no other.
 
     scans/name.ply, its landmarks, scans.csv  ->  set/meshes/name.ply, set.csv, skeleton.json,
                                                   registration.csv, limbs.csv, failures.csv, report.html
@@ -33,7 +33,7 @@ from .scan import RegisterScan, ScanSettings, mesh_file
 from .scans import ScanTask
 
 Progress = Callable[[int, int], None]
-SCANS = "scans/"                    # before the names of the results that are registered scans
+SCANS = "scans/"                    # prefix of the names under which registered scans are kept
 
 
 @dataclass(frozen=True)
@@ -68,7 +68,7 @@ class PrepareConfig(Settings):
 
 @dataclass(frozen=True, eq=False)
 class Prepared:
-    """What `prepare` did."""
+    """The result of `prepare`."""
 
     registered: RegisteredSet
     figures: tuple[ScanFigures, ...]    # of all scans in the set
@@ -80,24 +80,49 @@ def prepare(tasks: Sequence[ScanTask], template: Mesh, template_landmarks: Mappi
             config: PrepareConfig | None = None, progress: Progress | None = None,
             skeleton_progress: Progress | None = None, person_progress: Progress | None = None,
             scan_progress: Progress | None = None) -> Prepared:
-    """Register the template to every scan, find the skeleton, and write a page that shows how it went.
+    """Register the template to every scan, find the skeleton, and write a page that shows the result.
 
-    What the folder already holds is done again only where something that it depends on has changed. A scan that cannot
-    be read or registered is listed; scans of earlier calls, and a skeleton that was edited, stay as they are. Nothing
-    that is written depends on the number of workers, their order or interruptions, but for `times.csv`. ValueError for
-    a template that cannot serve, or a folder of other scans registered with another template or settings.
-    `scan_progress` is told of the steps of each scan that is registered in this process.
+    A result already in the folder is computed again only if something it depends on has changed. Scans that cannot be
+    read or registered are listed. Scans of earlier calls and an edited skeleton stay. Apart from `times.csv` nothing
+    depends on the number of workers, their order, or interruptions.
+
+    Parameters
+    ----------
+    tasks : sequence of ScanTask
+        The scans.
+    template : Mesh
+        One closed or bordered manifold component.
+    template_landmarks : mapping of str to int
+        Landmark name -> vertex of the template.
+    folder : str or Path
+        Folder of the set.
+    config : PrepareConfig, optional
+        Settings.
+    progress, skeleton_progress, person_progress : callable, optional
+        Called as progress(done, total) for scans, for the skeleton, and for the parts of a person.
+    scan_progress : callable, optional
+        The same for the steps of each scan that is registered in this process.
+
+    Returns
+    -------
+    Prepared
+
+    Raises
+    ------
+    ValueError
+        An unsuitable template, or a folder with other scans registered with another template or settings.
     """
     config = config or PrepareConfig()
     check_template(template)
     with workspace(folder) as space, one_thread():
         work, tasks = _set_up(space, tasks, template, template_landmarks, config, person_progress)
-        if not space.results(work):                   # the first call, or all is to be done anew
+        if not space.results(work):                   # the first call, or everything is computed again
             space.drop("skeleton")
         failures: dict[str, str] = {}
         fresh: set[str] = set()
         _write_tables(space, work, tasks, failures)
         try:
+            # register the scans; then doubted ones again, through a model of the good ones
             done = space.run(work, [Task(SCANS + task.name, task) for task in tasks], config.workers, progress,
                              scan_progress)
             failures = {name.removeprefix(SCANS): line for name, line in done.failures.items()}
@@ -110,13 +135,14 @@ def prepare(tasks: Sequence[ScanTask], template: Mesh, template_landmarks: Mappi
             _write_tables(space, work, tasks, failures)
             _write_skeleton(space, config, skeleton_progress)
         finally:
+            # also after an error or Ctrl-C: tables and page show what is finished
             prepared = _write_all(space, work, tasks, failures, len(fresh))
     return prepared
 
 
 def take_rival(tasks: Sequence[ScanTask], template: Mesh, template_landmarks: Mapping[str, int], folder: str | Path,
                config: PrepareConfig, name: str) -> Prepared:
-    """Exchange the two bodies that explain a scan: the rival is its registration now, and `prepare` leaves it so.
+    """Swap the two bodies that explain a scan: the rival becomes the registration, and `prepare` keeps that choice.
 
     Tasks, template and settings as the set was prepared with. ValueError for a scan without a rival, or one that was
     not registered from its files as they are now.
@@ -124,35 +150,36 @@ def take_rival(tasks: Sequence[ScanTask], template: Mesh, template_landmarks: Ma
     with workspace(folder) as space, one_thread():
         work, tasks = _set_up(space, tasks, template, template_landmarks, config, None)
         task = next((Task(SCANS + task.name, task) for task in tasks if task.name == name), None)
-        # where both bodies lie: in the folder of a later round, if that was better
-        former, file = find_better_scans(space, work).get(name, (None, mesh_file(name)))
+        # the folder of both bodies: that of a later round, if that was better
+        former_figures, file = find_better_scans(space, work).get(name, (None, mesh_file(name)))
         place = (space.folder / file).parent.parent
         if task is None or not has_rival(place, name):
             raise ValueError(f"{name}: there is no other body that explains this scan")
         if not space.is_done(work, task):
             raise ValueError(f"{name}: its files, or scapekit, have changed since; register it again first")
-        former = former or space.value(task.name)
+        former_figures = former_figures or space.value(task.name)
         rival = load_figures(place, name)
         with space.instead(work, task) as staged:
+            # swap mesh and pictures, as far as there are any
             pairs = [(mesh_file(name), rival_file(name))]
             pairs += [(f"{PICTURES}/{name}.{ending}", f"{RIVALS}/{name}.{ending}") for ending in ("webp", "scene")]
-            for one, other in pairs:
-                for source, target in ((one, other), (other, one)):
+            for file_name, rival_name in pairs:
+                for source, target in ((file_name, rival_name), (rival_name, file_name)):
                     if (place / source).is_file():                       # there may be no pictures
                         (staged.folder / target).parent.mkdir(exist_ok=True)
                         shutil.copyfile(place / source, staged.folder / target)
-            # somebody chose, so that there are two is no doubt of either; the time is that of finding both
-            doubts = tuple(doubt for doubt in former.doubts if doubt != TWO_BODIES)
-            save_figures(staged.folder, replace(former, doubts=doubts, seconds=np.nan), chosen=True)
-            staged.value = replace(rival, seconds=former.seconds)
-        drop_rounds(space, name)                                         # the choice counts, and no later round
+            # once chosen, having a rival is no doubt any more; the time was that of finding both
+            doubts = tuple(doubt for doubt in former_figures.doubts if doubt != TWO_BODIES)
+            save_figures(staged.folder, replace(former_figures, doubts=doubts, seconds=np.nan), chosen=True)
+            staged.value = replace(rival, seconds=former_figures.seconds)
+        drop_rounds(space, name)               # the choice replaces registrations of later rounds
         return _write_all(space, work, tasks, read_failures(space.folder), 0)
 
 
 def _set_up(space: Workspace, tasks: Sequence[ScanTask], template: Mesh, template_landmarks: Mapping[str, int],
             config: PrepareConfig, progress: Progress | None) -> tuple[RegisterScan, list[ScanTask]]:
-    """The work on each scan of a set, and the scans with the model that leads the template to them."""
-    # without what the template has worked out about itself: it is sent around
+    """Prepare the work on each scan of a set, and the scans with the model that leads the template to them."""
+    # a fresh copy without cached properties, as it is sent to the workers
     bare = Mesh(template.vertices, template.faces, template.colors)
     parts = space.step("person", bare, lambda folder: person_parts(bare, progress))
     model = Path(config.scan.through) if Path(config.scan.through).is_file() else None
@@ -164,7 +191,7 @@ def _set_up(space: Workspace, tasks: Sequence[ScanTask], template: Mesh, templat
 
 def _write_all(space: Workspace, work: RegisterScan, tasks: Sequence[ScanTask], failures: Mapping[str, str],
                fresh: int) -> Prepared:
-    """Write the tables and the page of a set; returns what is in it."""
+    """Write the tables and the page of a set; return what is in it."""
     figures = _write_tables(space, work, tasks, failures)
     with space.staging("page") as staged:
         write_set_page(space.folder, to=staged.folder)
@@ -174,7 +201,7 @@ def _write_all(space: Workspace, work: RegisterScan, tasks: Sequence[ScanTask], 
 
 def _lead(space: Workspace, template: Mesh, tasks: Sequence[ScanTask], through: str, progress: Progress | None
           ) -> Lead | None:
-    """What finds bodies on the scans, if they need it: a model laid on the template, once for the set."""
+    """Build the model that leads the template to scans without landmarks, once for the set; None if not needed."""
     if through in ("none", "pose") or (through == "auto" and all(task.landmarks is not None for task in tasks)):
         return None
     model = next((task.model for task in tasks), None)
@@ -183,17 +210,17 @@ def _lead(space: Workspace, template: Mesh, tasks: Sequence[ScanTask], through: 
 
 def _write_tables(space: Workspace, work: RegisterScan, tasks: Sequence[ScanTask], failures: Mapping[str, str]
                   ) -> dict[str, ScanFigures]:
-    """Everything in the set but meshes, pictures, skeleton and page, of the results that are there: their figures."""
+    """Write everything but meshes, pictures, skeleton and page, from the results that exist; return the figures."""
     better = find_better_scans(space, work)
-    figures = _first_figures(space, work) | {name: found for name, (found, _) in better.items()}
-    # scans of earlier calls stay, if all were registered in the same way
+    figures = _first_figures(space, work) | {name: better_figures for name, (better_figures, _) in better.items()}
+    # scans of earlier calls stay if they were registered with the same template and settings
     names = {task.name for task in tasks}
     entries = {entry.name: entry for entry in read_entries(space.folder, names)} \
         if (space.folder / "set.json").exists() else {}
-    lost = [name for name in entries if name not in figures and name not in names]
-    if lost:
-        raise ValueError(f"{space.folder}: holds {len(lost)} other scans that were registered with "
-                         f"another template, settings or scapekit ({', '.join(lost[:5])}); name another folder")
+    foreign = [name for name in entries if name not in figures and name not in names]
+    if foreign:
+        raise ValueError(f"{space.folder}: holds {len(foreign)} other scans that were registered with "
+                         f"another template, settings or scapekit ({', '.join(foreign[:5])}); name another folder")
     entries |= {t.name: SetEntry(t.name, t.subject, t.pose, t.sex, mesh_file(t.name)) for t in tasks}
     entries |= {name: replace(entries[name], file=file) for name, (_, file) in better.items() if name in entries}
     with space.staging("tables") as staged:
@@ -202,30 +229,31 @@ def _write_tables(space: Workspace, work: RegisterScan, tasks: Sequence[ScanTask
         write_landmarks(staged.folder / "landmarks.json", dict(work.landmarks))
         write_figures(staged.folder, figures.values())
         if work.parts is not None:
-            write_doubts(staged.folder, {name: each.doubts for name, each in figures.items()})
+            write_doubts(staged.folder, {name: scan_figures.doubts for name, scan_figures in figures.items()})
         write_failures(staged.folder, failures)
     return figures
 
 
 def _first_figures(space: Workspace, work: RegisterScan) -> dict[str, ScanFigures]:
-    """The figures of all scans as they were registered first."""
-    return {name.removeprefix(SCANS): found for name, found in space.results(work).items() if name.startswith(SCANS)}
+    """Return the figures of all scans as they were registered first."""
+    return {name.removeprefix(SCANS): each for name, each in space.results(work).items() if name.startswith(SCANS)}
 
 
 def _write_skeleton(space: Workspace, config: PrepareConfig, progress: Progress | None) -> None:
-    """The skeleton of the subject with the most meshes, found anew when one of them has changed."""
+    """Find the skeleton from the subject with most meshes, again when one of them has changed."""
     registered, path = RegisteredSet.load(space.folder), space.folder / "skeleton.json"
     if path.exists() and not space.is_ours(path.name):
         return                                                  # edited by hand: it is the user's now
     subjects = [entry.subject for entry in registered.entries]
-    most = max(subjects, key=subjects.count, default="")
-    if subjects.count(most) < config.min_poses:
+    subject = max(subjects, key=subjects.count, default="")
+    if subjects.count(subject) < config.min_poses:
         space.drop("skeleton")
         return
-    meshes = [space.folder / entry.file for entry in registered.entries if entry.subject == most]
+    meshes = [space.folder / entry.file for entry in registered.entries if entry.subject == subject]
 
     def find(folder: Path) -> None:
-        find_skeleton(registered.template, registered.poses(most), config.skeleton,
+        """Find the skeleton and write it."""
+        find_skeleton(registered.template, registered.poses(subject), config.skeleton,
                       progress=progress).save(folder / path.name)
 
     space.step("skeleton", (registered.template, meshes, config.skeleton), find)

@@ -1,4 +1,4 @@
-"""One scan of a folder: read, registered, measured, its picture taken."""
+"""One scan of a folder: read it, register the template, measure the result, take its picture."""
 from __future__ import annotations
 
 import time
@@ -65,37 +65,42 @@ class ScanSettings(Settings):
 
 @dataclass(frozen=True, eq=False)
 class RegisteredScan:
-    """What a scan became."""
+    """The result of registering one scan."""
 
     vertices: np.ndarray            # (N, 3), metres
     figures: ScanFigures
-    picture: bytes = b""            # a strip of small pictures as a WebP file; empty where none were asked for
+    picture: bytes = b""            # strip of small pictures as WebP; empty where none were wanted
     scene: bytes = b""              # the same for the browser
-    rival: RegisteredScan | None = None     # another body that explains the scan as well
+    rival: RegisteredScan | None = None     # second body that explains the scan equally well
 
 
 def register_scan(task: ScanTask, template: Mesh, template_landmarks: dict[str, int], settings: ScanSettings,
                   parts: PersonParts | None = None, progress: Progress | None = None, lead: Lead | None = None
                   ) -> RegisteredScan:
-    """Read and register one scan, and try other rolls of limbs where the template has the parts of a person.
+    """Read and register one scan, and repair twisted limbs where the template has the parts of a person.
 
-    A `lead` finds a body on scans without landmarks, or with few.
+    A `lead` finds the body on scans without landmarks, or with few.
 
-    ValueError for files that cannot be read, or a registration that means nothing.
+    Raises
+    ------
+    ValueError
+        Files that cannot be read, the wrong unit, or a registration that does not lie on the scan.
     """
     start = time.perf_counter()
     with one_thread():
         scan, removed = read_scan(task.scan, settings.unit), 0.0
-        # another unit is refused before minutes of work; a room around the body, or a hand alone, is none
-        found = extent(scan.vertices if isinstance(scan, Mesh) else scan) / extent(template.vertices)
-        if not 1 / 30 < found < 30:
-            raise ValueError(f"{task.scan}: it is {found:.3g} times as large as the template: the wrong unit? (--unit)")
+        # a factor of 30 is a wrong unit, refused before minutes of work; a room around the body, or one hand, passes
+        ratio = extent(scan.vertices if isinstance(scan, Mesh) else scan) / extent(template.vertices)
+        if not 1 / 30 < ratio < 30:
+            raise ValueError(f"{task.scan}: it is {ratio:.3g} times as large as the template: the wrong unit? (--unit)")
         landmarks = _landmarks(task, scan, template_landmarks, settings)
+        # remove floor and clutter, if asked for or if there are no landmarks to keep the body apart
         if settings.clean is not None:
             cleaned = clean_scan(scan, settings.clean, None if landmarks is None else landmarks[1])
             scan, removed = cleaned.scan, 1 - float(cleaned.kept.mean())
         elif landmarks is None and settings.through != "pose":
             scan, removed = take_clutter(scan)
+        # register: from the template's own pose, or led by landmarks, a model or correspondences
         if settings.through == "pose":
             fit = register(template, scan, None, settings.registration, progress)
             if not registration_problem(template, scan, fit, marked=False):
@@ -107,19 +112,20 @@ def register_scan(task: ScanTask, template: Mesh, template_landmarks: dict[str, 
                                       settings.correspondences, progress, task.model)
             except ValueError as error:
                 raise ValueError(f"{error} (landmarks beside the scan need no ends of limbs)") from None
+        # refuse a registration that is not on the scan, or has left and right limbs exchanged
         problem = registration_problem(template, scan, led.fit, landmarks is not None)
         if problem:
             raise ValueError(f"{task.scan}: the template is not on it: {problem}")
         if parts is not None and (problem := find_exchanged_sides(template, parts, led.fit.mesh.vertices)):
             raise ValueError(f"{task.scan}: the template is not on it: {problem}")
-        done = finish_scan(task.name, template, scan, led, parts, removed, settings.pictures)
-        doubts = done.figures.doubts if done.rival is None else (*done.figures.doubts, TWO_BODIES)
-    return replace(done, figures=replace(done.figures, doubts=doubts, seconds=time.perf_counter() - start))
+        registered = finish_scan(task.name, template, scan, led, parts, removed, settings.pictures)
+        doubts = registered.figures.doubts if registered.rival is None else (*registered.figures.doubts, TWO_BODIES)
+    return replace(registered, figures=replace(registered.figures, doubts=doubts, seconds=time.perf_counter() - start))
 
 
 def finish_scan(name: str, template: Mesh, scan: Mesh | np.ndarray, led: LedRegistration, parts: PersonParts | None,
                 removed: float, pictures: bool) -> RegisteredScan:
-    """Bring the soles of a registration to the floor, measure it and take its picture; the same with its rival."""
+    """Press the soles to the floor, measure the registration and take its picture; the same for its rival."""
     fit = with_soles(template, scan, led.fit, parts)
     picture = scene = b""
     if pictures:
@@ -135,60 +141,62 @@ def finish_scan(name: str, template: Mesh, scan: Mesh | np.ndarray, led: LedRegi
 
 @dataclass(frozen=True, eq=False)
 class RegisterScan:
-    """The work on each scan: the template brought onto it."""
+    """The work on each scan: register the template to it."""
 
     template: Mesh
     landmarks: Mapping[str, int]
     settings: ScanSettings
     parts: PersonParts | None = None         # of the template, where it is a person
-    # what finds bodies on scans, where some have few landmarks or none: it follows from template and settings
+    # finds bodies on scans with few or no landmarks; not in the digest, as it follows from template and settings
     lead: Lead | None = field(default=None, metadata={"digest": False})
 
-    def __call__(self, task: ScanTask, room: TaskContext) -> ScanFigures:
-        found = self.register(task, room)
-        self.write(room.folder, task.name, found)
-        return found.figures
+    def __call__(self, task: ScanTask, context: TaskContext) -> ScanFigures:
+        """Register one scan and write its files; return the figures."""
+        registered = self.register(task, context)
+        self.write(context.folder, task.name, registered)
+        return registered.figures
 
-    def register(self, task: ScanTask, room: TaskContext) -> RegisteredScan:
-        """Bring the template onto a scan."""
-        return register_scan(task, self.template, dict(self.landmarks), self.settings, self.parts, room.tell, self.lead)
+    def register(self, task: ScanTask, context: TaskContext) -> RegisteredScan:
+        """Register the template to a scan."""
+        return register_scan(task, self.template, dict(self.landmarks), self.settings, self.parts, context.tell,
+                             self.lead)
 
-    def write(self, folder: Path, name: str, found: RegisteredScan) -> None:
-        """Write the mesh and the pictures of a scan into a folder, and those of its rival with its figures."""
+    def write(self, folder: Path, name: str, registered: RegisteredScan) -> None:
+        """Write mesh and pictures of a scan into a folder, and those of its rival with its figures."""
         from .page import PICTURES
 
-        write_mesh(folder / mesh_file(name), self.template.with_vertices(found.vertices))
-        write_pictures(folder / PICTURES, name, found)
-        if found.rival is not None:
-            write_mesh(folder / rival_file(name), self.template.with_vertices(found.rival.vertices))
-            write_pictures(folder / RIVALS, name, found.rival)
-            save_figures(folder, found.rival.figures, chosen=False)
+        write_mesh(folder / mesh_file(name), self.template.with_vertices(registered.vertices))
+        write_pictures(folder / PICTURES, name, registered)
+        if registered.rival is not None:
+            write_mesh(folder / rival_file(name), self.template.with_vertices(registered.rival.vertices))
+            write_pictures(folder / RIVALS, name, registered.rival)
+            save_figures(folder, registered.rival.figures, chosen=False)
 
 
-def write_pictures(folder: Path, name: str, found: RegisteredScan) -> None:
-    """Write the pictures of a scan into a folder, where they were taken."""
-    if found.picture:
+def write_pictures(folder: Path, name: str, registered: RegisteredScan) -> None:
+    """Write the pictures of a scan into a folder, if they were taken."""
+    if registered.picture:
         folder.mkdir(exist_ok=True)
-        (folder / f"{name}.webp").write_bytes(found.picture)
-        (folder / f"{name}.scene").write_bytes(found.scene)
+        (folder / f"{name}.webp").write_bytes(registered.picture)
+        (folder / f"{name}.scene").write_bytes(registered.scene)
 
 
 def mesh_file(name: str) -> str:
-    """Where the mesh of a scan stands in a set."""
+    """Return the path of a scan's mesh inside a set."""
     return f"meshes/{name}.ply"
 
 
 def size_doubts(template: Mesh, parts: PersonParts, vertices: np.ndarray) -> tuple[PlausibilityIssue, ...]:
-    """What is unlikely in the size of a person on whom the template's vertices (N, 3), metres, lie."""
+    """Return what is implausible in the size of a person, from the template's vertices (N, 3), metres, on the scan."""
     sized = implausible_body(stature(template, parts, vertices))
     return tuple(PlausibilityIssue(2.0 if sized.problems else 1.0, reason) for reason in sized.reasons)
 
 
 def _landmarks(task: ScanTask, scan: Mesh | np.ndarray, template_landmarks: dict[str, int], settings: ScanSettings
                ) -> Landmarks | None:
-    """Vertices of the template and points of the scan, or None where there are none."""
+    """Return vertices of the template and points of the scan that correspond, or None where there are too few."""
     if task.landmarks is None or settings.through == "pose":
         return None
-    found = read_landmarks(task.landmarks, scan, settings.unit)
-    check_on_surface(task.landmarks, found, scan.vertices if isinstance(scan, Mesh) else scan)
-    return try_match_landmarks(task.landmarks, template_landmarks, found)
+    points = read_landmarks(task.landmarks, scan, settings.unit)
+    check_on_surface(task.landmarks, points, scan.vertices if isinstance(scan, Mesh) else scan)
+    return try_match_landmarks(task.landmarks, template_landmarks, points)

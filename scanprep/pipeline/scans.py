@@ -1,4 +1,4 @@
-"""The scans of a folder, their landmark files, and what a table says of them."""
+"""The scans of a folder, their landmark files, and the table about them."""
 from __future__ import annotations
 
 from dataclasses import dataclass, field
@@ -9,8 +9,8 @@ from ..geometry import storage, tables
 from ..geometry.files import SCAN_ENDINGS, MeshFileError, is_scan, list_files, name_of
 from ..geometry.landmarks import landmarks_beside
 
-TABLE = "scans.csv"
-ABOUT = {"digest": False}         # what is only told in tables: no registration depends on it
+TABLE = "scans.csv"               # optional table beside the scans
+ABOUT = {"digest": False}         # fields that only go into tables, so changing them registers nothing again
 
 
 @dataclass(frozen=True)
@@ -23,22 +23,26 @@ class ScanTask:
     subject: str = field(default="", metadata=ABOUT)
     pose: str = field(default="", metadata=ABOUT)
     sex: str = field(default="", metadata=ABOUT)
-    model: Path | None = None         # the file of the model that leads the template, if not the built-in people
+    model: Path | None = None         # file of the model that leads the template; None: the built-in people
 
 
 def find_scans(folder: str | Path, landmarks: str | Path | None = None, subject: str = "") -> list[ScanTask]:
-    """The scans of a folder sorted by name, their landmark files, and what `scans.csv` says of them.
+    """Find the scans of a folder sorted by name, their landmark files, and what `scans.csv` says of them.
 
-    The name is that of the file without its ending; a landmark file has the same name, in `landmarks`, in the folder
-    `landmarks` inside, or beside the scan; where `landmarks` is the word none, nowhere. Where `scans.csv` (name,
-    subject, pose, sex) does not say whose scan it is, it is of `subject`, or of a person of its own. ValueError for no
-    scans, or two of one name.
+    The name is the file name without ending. A landmark file has the same name. It is in the folder `landmarks` that is
+    given, else in one of that name inside, or beside the scan. The word none means no landmarks. A scan whose subject
+    is not in `scans.csv` (name, subject, pose, sex) is of `subject`, else of a person of its own.
+
+    Raises
+    ------
+    ValueError
+        No scans, two of the same name, or a table about other scans.
     """
     folder = Path(folder)
     paths: dict[str, Path] = {}
     for path in list_files(folder, is_scan):
         name = name_of(path)
-        if visible(name) != name or "\n" in name:            # it will stand in tables, pages and messages
+        if visible(name) != name or "\n" in name:            # names appear in tables, pages and messages
             raise ValueError(f"{folder}: expected names without control characters, found {path.name!a}; "
                              "rename it")
         if name in paths:
@@ -46,6 +50,7 @@ def find_scans(folder: str | Path, landmarks: str | Path | None = None, subject:
                              f"of the name '{name}'; rename one, or merge them where they are views of one scan")
         paths[name] = path
     if not paths:
+        # a hint for somebody who named the folder above
         inner = [place.name for place in sorted(folder.iterdir()) if place.is_dir() and list_files(place, is_scan)]
         hint = f"; there are some in its folders {', '.join(inner[:5])}: name one of them" if inner else ""
         raise MeshFileError(f"{folder}: expected scans ({', '.join(SCAN_ENDINGS)}), found none{hint}")
@@ -56,6 +61,7 @@ def find_scans(folder: str | Path, landmarks: str | Path | None = None, subject:
     if landmarks and not means_none(landmarks) and not Path(landmarks).is_dir():
         raise ValueError(f"landmarks: expected a folder, there is none at {landmarks}")
     places = [folder / "landmarks", folder] if not landmarks else [] if means_none(landmarks) else [Path(landmarks)]
+    # join each file with its row of the table and its landmark file
     tasks = []
     for name, path in sorted(paths.items()):
         row = about.get(name, {})
@@ -66,11 +72,12 @@ def find_scans(folder: str | Path, landmarks: str | Path | None = None, subject:
 
 
 def means_none(landmarks: str | Path | None) -> bool:
-    """Whether a folder of landmarks is none, but the word."""
+    """Return whether a landmarks argument is the word none, and no folder of that name."""
     return landmarks is not None and Path(landmarks).name == "none" and not Path(landmarks).exists()
 
 
 def _read_table(path: Path) -> dict[str, dict[str, str]]:
+    """Read `scans.csv`: name -> row; empty where there is none."""
     if not path.exists():
         return {}
     about: dict[str, dict[str, str]] = {}

@@ -60,24 +60,27 @@ def align(source: MeshArg, target: Annotated[Path, Place("TARGET")], output: Out
         beside = landmarks_beside(target)
         if beside is None:
             raise ValueError(f"{landmarks}: {target} has no landmarks; expected a file of its name beside it")
-        _, mine, theirs = match_landmarks(read_landmarks(landmarks, moving, unit), read_landmarks(beside, fixed, unit))
-        T = align_landmarks(mine, theirs).T_target_source
+        _, source_points, target_points = match_landmarks(read_landmarks(landmarks, moving, unit),
+                                                          read_landmarks(beside, fixed, unit))
+        T = align_landmarks(source_points, target_points).T_target_source
+    # refine by the surfaces, from where the landmarks put the mesh
     placed = moving.with_vertices(moving.vertices @ T[:3, :3].T + T[:3, 3])
-    found = align_rigid(placed, fixed, config=config)
-    T = found.T_target_source @ T
+    alignment = align_rigid(placed, fixed, config=config)
+    T = alignment.T_target_source @ T
     write_mesh(output, moving.with_vertices(moving.vertices @ T[:3, :3].T + T[:3, 3]))
     return Outcome(output, [
-        Metric("RMS distance", MM * found.rms, "mm"), Metric("converged", str(found.converged)),
+        Metric("RMS distance", MM * alignment.rms, "mm"), Metric("converged", str(alignment.converged)),
         Metric("T_target_source", np.array2string(T, precision=6).replace("\n", " "))], {"align": config},
-        judgement=Judgement.of(alignment_problem(moving.vertices, fixed.vertices, found), [] if found.converged else [
-            f"it did not converge, at {MM * found.rms:.0f} mm RMS: a start far from the target?"]))
+        judgement=Judgement.of(alignment_problem(moving.vertices, fixed.vertices, alignment),
+                               [] if alignment.converged else [
+            f"it did not converge, at {MM * alignment.rms:.0f} mm RMS: a start far from the target?"]))
 
 
 def _read_landmarks(template: Path, body: Mesh, scan: Path, data: Mesh | np.ndarray, landmarks: Path | None,
                     template_landmarks: Path | None, unit: Unit | None) -> tuple[Landmarks | None, list[Metric]]:
-    """Vertices of the template and points of the scan that carry the same names, and the rows that say so.
+    """Read the landmarks that template and scan share, and the table rows that report them.
 
-    They are in the file named, else in the one beside the scan; the word none is none.
+    The scan's landmarks come from the named file, else from the file beside the scan; the word none means no landmarks.
     """
     file = None if landmarks == Path("none") and not landmarks.exists() else landmarks or landmarks_beside(scan)
     if file is None:
@@ -102,17 +105,18 @@ def correspond(scan: ScanArg, template: Path, output: Output, landmarks: Path | 
             With none, or the word none, the ends of the limbs are looked for.
         template_landmarks: Landmarks of the template; else the file of its name beside it.
         unit: Unit of the scan and its landmarks.
+        config: Settings.
     """
     body, data = read_mesh(template), read_scan(scan, unit)
     pairs, led_by = _read_landmarks(template, body, scan, data, landmarks, template_landmarks, unit)
     with bar("finding correspondences") as progress:
-        found = find_correspondences(body, data, pairs, config, progress)
-    write_correspondences(output, found)
+        pairs_found = find_correspondences(body, data, pairs, config, progress)
+    write_correspondences(output, pairs_found)
     return Outcome(output, [
-        Metric("method", found.method), *led_by, Metric("correspondences", len(found)),
-        Metric("confidence, median", float(np.median(found.confidence))),
-        Metric("converged", str(found.converged))], {"correspond": config},
-        judgement=Judgement.of(correspondences_problem(found), correspondences_doubts(found)))
+        Metric("method", pairs_found.method), *led_by, Metric("correspondences", len(pairs_found)),
+        Metric("confidence, median", float(np.median(pairs_found.confidence))),
+        Metric("converged", str(pairs_found.converged))], {"correspond": config},
+        judgement=Judgement.of(correspondences_problem(pairs_found), correspondences_doubts(pairs_found)))
 
 
 def register_one(scan: ScanArg, template: Path, output: Output, landmarks: Path | None = None,
@@ -133,23 +137,26 @@ def register_one(scan: ScanArg, template: Path, output: Output, landmarks: Path 
             scan; auto, the built-in people where the template is a person, else pose; a .json file of
             scape prep correspond; none, correspondences; pose: without landmarks it must be near the template's pose.
         unit: Unit of the scan and its landmarks.
+        config: Settings.
     """
     body, data = read_mesh(template), read_scan(scan, unit)
-    given = Path(through) if through.endswith(".json") else None
-    pairs, led_by = (None, [Metric("landmarks", 0)]) if given and landmarks is None else _read_landmarks(
+    correspondence_file = Path(through) if through.endswith(".json") else None
+    pairs, led_by = (None, [Metric("landmarks", 0)]) if correspondence_file and landmarks is None else _read_landmarks(
         template, body, scan, data, landmarks, template_landmarks, unit)
+    # with too few landmarks a body model proposes where the body is
     lead = None
-    if given is None and through != "pose" and (pairs is None or len(pairs[0]) < FEW):
+    if correspondence_file is None and through != "pose" and (pairs is None or len(pairs[0]) < FEW):
         with bar("laying the model on the template") as progress:
             lead = lead_of(body, through, progress)
-    # a model of people brings their parts along
+    # a model of people knows the body parts already
     parts = None if lead is None else lead.parts
     if parts is None:
         with bar("finding the parts of a person") as progress:
             parts = person_parts(body, progress)
+    # register: from the pose as it is or from correspondences; else led by the model or few landmarks
     rival: LedRegistration | None = None
-    if given or through == "pose" or (pairs is None and lead is None and through == "auto"):
-        hints = read_correspondences(given) if given else None
+    if correspondence_file or through == "pose" or (pairs is None and lead is None and through == "auto"):
+        hints = read_correspondences(correspondence_file) if correspondence_file else None
         with bar("registering") as progress:
             fit = register(body, data, pairs, config=config, progress=progress, correspondences=hints)
         with bar("trying other rolls of limbs") as progress:
@@ -162,6 +169,7 @@ def register_one(scan: ScanArg, template: Path, output: Output, landmarks: Path 
             led = register_by_any(body, data, pairs, lead, parts, config, progress=progress)
         fit, rival = led.fit, led.rival
         led_by.append(Metric("led by", led.way))
+    # rest the soles on the floor if the scan ends flat there
     fit = with_soles(body, data, fit, parts)
     write_mesh(output, fit.mesh)
     return Outcome(output, [
@@ -181,10 +189,11 @@ Landmarks = tuple[np.ndarray, np.ndarray]
 
 def judge_registration(name: str, template: Mesh, scan: Mesh | np.ndarray, fit: Registration, pairs: Landmarks | None,
                        parts: PersonParts | None, has_rival: bool = False) -> Judgement:
-    """What the registration of one scan is worth: by the limits of a set of scans, and whether it is of a person.
+    """Judge the registration of one scan by the limits used for sets, and by whether it is a plausible person.
 
-    `has_rival` is whether another body explains the scan as well.
+    `has_rival` says whether another body explains the scan about as well.
     """
+    # first what makes the registration meaningless, then what only needs a look
     problem = registration_problem(template, scan, fit, pairs is not None) or (
         find_exchanged_sides(template, parts, fit.mesh.vertices) if parts else None)
     doubts = limb_doubts(template, parts, fit.mesh.vertices) if parts else ()
@@ -193,5 +202,5 @@ def judge_registration(name: str, template: Mesh, scan: Mesh | np.ndarray, fit: 
     rival = Judgement.of(check=[f"{RIVAL}: click some landmarks, left and right, to decide"] if has_rival else [])
     if parts is None or problem is not None:
         return verdict.judgement.merge(rival)
-    # of a body that is too large or too small the size is the cause, limbs out of shape are what comes of it
+    # an implausible stature comes first: it is often the cause of implausible limbs
     return implausible_body(stature(template, parts, fit.mesh.vertices)).merge(verdict.judgement, rival)

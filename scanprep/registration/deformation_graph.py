@@ -54,17 +54,17 @@ class DeformationGraph:
 
 @lru_cache(maxsize=4)                # a folder of scans shares one template
 def build_graph(template: Mesh, count: int, carriers: int = 4, reach: float = 0.18) -> DeformationGraph:
-    """So many nodes spread over a template, linked along and through the body.
+    """Build a graph of `count` nodes spread over a template, linked along the surface and through the body.
 
-    Neighbours on the surface are linked, and so are nodes that face each other through the inside, up to `reach` times
-    the root of the template's area: these keep the thickness of limbs where the scan shows nothing, and make a limb's
-    cross-section rotate as one.
+    Nodes that face each other through the inside are linked too, up to `reach` times the root of the template's area.
+    These inner links keep the thickness of limbs where the scan has no data. They make a cross-section rotate as one.
     """
     nodes = farthest_points(template.vertices, min(count, len(template.vertices)))
     carrying, weights = _carriers(template, nodes, min(carriers, len(nodes) - 1))
-    # on the surface, nodes that carry a vertex together
+    # surface links: two nodes that carry the same vertex
     pairs = np.concatenate([carrying[:, pair] for pair in combinations(range(carrying.shape[1]), 2)])
     inner = _inner_links(template, nodes, reach * np.sqrt(template.face_areas.sum()))
+    # each pair once, then both directions; every node shares its area among its edges
     links = np.unique(np.sort(np.concatenate([pairs[pairs[:, 0] != pairs[:, 1]], inner]), axis=1), axis=0)
     edges = np.concatenate([links, links[:, ::-1]])
     area = np.bincount(carrying.ravel(), (weights * template.vertex_areas[:, None]).ravel(), len(nodes))
@@ -73,13 +73,15 @@ def build_graph(template: Mesh, count: int, carriers: int = 4, reach: float = 0.
 
 
 def _carriers(template: Mesh, nodes: np.ndarray, K: int) -> tuple[np.ndarray, np.ndarray]:
-    """The K nodes nearest to each vertex along the surface (N, K) and their shares (N, K)."""
+    """Find the K nodes nearest to each vertex along the surface (N, K) and their weights (N, K)."""
     a, b = template.edges.T
     N = len(template.vertices)
     lengths = csr_array(coo_array((template.edge_lengths, (a, b)), shape=(N, N)))
     best = np.full((N, K + 1), np.inf)
     index = np.zeros((N, K + 1), dtype=np.int64)
+    # nodes farther than four mean node spacings never carry a vertex; this keeps the search short
     limit = 4 * np.sqrt(template.face_areas.sum() / len(nodes))
+    # keep the K + 1 nearest nodes of every vertex; 128 nodes at a time bound the memory
     for first in range(0, len(nodes), 128):
         block = nodes[first:first + 128]
         distance = dijkstra(lengths, directed=False, indices=block, limit=limit).T
@@ -90,10 +92,12 @@ def _carriers(template: Mesh, nodes: np.ndarray, K: int) -> tuple[np.ndarray, np
         index = np.take_along_axis(number, order, axis=1)
     order = np.argsort(best, axis=1)
     best, index = np.take_along_axis(best, order, axis=1), np.take_along_axis(index, order, axis=1)
+    # vertices that no node reaches along the surface take the nearest node in a straight line
     lost = np.flatnonzero(~np.isfinite(best[:, 0]))
     if len(lost):
         straight = ((template.vertices[lost, None] - template.vertices[nodes]) ** 2).sum(axis=-1)
         index[lost], best[lost, 0] = np.argmin(straight, axis=1)[:, None], 0.0
+    # weights fall to zero at the distance of the (K + 1)th node, so they change smoothly over the surface
     radius = np.where(np.isfinite(best[:, -1]), best[:, -1], 1.2 * limit)[:, None]
     share = np.where(np.isfinite(best[:, :K]), np.maximum(1 - best[:, :K] / radius, 0) ** 2, 0.0)
     share[:, 0] += 1e-9
@@ -102,19 +106,22 @@ def _carriers(template: Mesh, nodes: np.ndarray, K: int) -> tuple[np.ndarray, np
 
 
 def _inner_links(template: Mesh, nodes: np.ndarray, reach: float, most: int = 8) -> np.ndarray:
-    """(L, 2) pairs of nodes that see each other through the inside, for each node the `most` nearest."""
+    """Find pairs (L, 2) of nodes that see each other through the inside, at most the `most` nearest of each node."""
     points, normals = template.vertices[nodes], template.vertex_normals[nodes]
     pairs = cKDTree(points).query_pairs(reach, output_type="ndarray")
     i, j = np.concatenate([pairs, pairs[:, ::-1]]).T
     along = points[j] - points[i]
     length = np.linalg.norm(along, axis=1)
     along /= np.maximum(length, 1e-12)[:, None]
+    # both normals must point away from the other node: more than about 107 degrees off the line between them
     inward = (np.einsum("nd,nd->n", normals[i], along) < -0.3) & (np.einsum("nd,nd->n", normals[j], along) > 0.3)
     i, j, along, length = i[inward], j[inward], along[inward], length[inward]
+    # cast a ray from just below the skin; it must first hit the surface at the other node
     skin = 0.02 * reach
     _, hit = Rays(template).cast(points[i] + skin * along, along)
     clear = np.abs(hit + skin - length) < skin
     i, j, length = i[clear], j[clear], length[clear]
+    # rank the partners of every node by distance
     order = np.lexsort((length, i))
     i, j = i[order], j[order]
     rank = np.arange(len(i)) - np.searchsorted(i, i)
@@ -123,7 +130,7 @@ def _inner_links(template: Mesh, nodes: np.ndarray, reach: float, most: int = 8)
 
 @dataclass(frozen=True, eq=False)
 class NodeMotion:
-    """How every node has rotated, R (M, 3, 3), grown, log_scale (M,), and moved: positions (M, 3), metres."""
+    """Rotation R (M, 3, 3), growth log_scale (M,) and positions (M, 3), metres, of every node."""
 
     R: np.ndarray
     log_scale: np.ndarray
@@ -135,21 +142,22 @@ class NodeMotion:
         return np.exp(self.log_scale)[:, None, None] * self.R
 
     def advance(self, step: np.ndarray) -> NodeMotion:
-        """After a step (M, 7): left rotation (radians), change of log-scale, translation (metres)."""
+        """Return the motion after a step (M, 7): left rotation (radians), change of log-scale, translation (metres)."""
         return replace(self, R=rotations.exp(step[:, :3]) @ self.R, log_scale=self.log_scale + step[:, 3],
                        positions=self.positions + step[:, 4:])
 
 
 def arms(graph: DeformationGraph, motion: NodeMotion, vertices: np.ndarray) -> np.ndarray:
-    """(n, K, 3) from each carrying node to each of the vertices (n,), as the node sees it, metres."""
+    """Return vectors (n, K, 3), metres, from each carrying node to each of the vertices (n,), moved with the node."""
     carriers = graph.carriers[vertices]
     local = graph.rest[vertices, None] - graph.nodes[carriers]
     return np.matmul(motion.linear[carriers], local[..., None])[..., 0]
 
 
 def deform(graph: DeformationGraph, motion: NodeMotion) -> np.ndarray:
-    """The template's vertices (N, 3) after the motion, metres."""
+    """Return the template's vertices (N, 3), metres, after the motion: the weighted mean of what their nodes say."""
     linear = motion.linear
+    # each node is an affine map x -> linear x + offset; blending the maps once is cheaper than the vertices
     offset = motion.positions - np.matmul(linear, graph.nodes[..., None])[..., 0]
     affine = np.concatenate([linear, offset[..., None]], axis=2).reshape(-1, 12)
     blended = np.einsum("nk,nkc->nc", graph.weights, affine[graph.carriers]).reshape(-1, 3, 4)
@@ -157,7 +165,7 @@ def deform(graph: DeformationGraph, motion: NodeMotion) -> np.ndarray:
 
 
 def refine_motion(old: DeformationGraph, motion: NodeMotion, new: DeformationGraph) -> NodeMotion:
-    """The motion of a finer graph of the same template that repeats the motion of a coarser one."""
+    """Transfer the motion of a coarse graph to a finer graph of the same template."""
     at = new.node_vertices
     w, carriers = old.weights[at], old.carriers[at]
     R = rotations.project(np.einsum("mk,mkij->mij", w, motion.R[carriers]))
@@ -165,11 +173,12 @@ def refine_motion(old: DeformationGraph, motion: NodeMotion, new: DeformationGra
 
 
 def motion_of(graph: DeformationGraph, x: np.ndarray) -> NodeMotion:
-    """The motion of the nodes that takes the template to vertices (N, 3), metres: what best carries their links."""
+    """Estimate the motion of the nodes that takes the template to vertices (N, 3), metres, from their edges."""
     i, j = graph.edges.T
     at = x[graph.node_vertices]
     now, rest = at[j] - at[i], graph.edge_vectors
     gather = gatherer(i, len(at))
+    # rotation by orthogonal Procrustes over the edges of a node, growth by the ratio of their lengths
     R = rotations.project(sum_groups(gather, np.einsum("ei,ej->eij", now, rest)))
     grown = gather @ (now**2).sum(axis=1) / (gather @ (rest**2).sum(axis=1))
     return NodeMotion(R, 0.5 * np.log(grown), at)

@@ -1,4 +1,4 @@
-"""How well the template lies on each scan: figures, their tables in the folder of the set, which scans need a look."""
+"""Quality figures of registrations, their tables in the folder of a set, and which scans need a look."""
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -18,9 +18,10 @@ from .nonrigid import Registration, share_stretched
 
 UNSEEN = 0.15                  # share of vertices that four views of a person leave without data
 NONE = "none"                  # what a table says where a figure has no value
-# Weights of the logarithms of evidence; `certain` is the log-odds of a registration that nothing speaks against. By
-# `fit_weights` of tests/benchmarks/reliability.py on 72 scans. Weights of one half of these told of the other with a
-# Brier score of 0.16, where the share of right ones has 0.22. Inverted triangles were hardly seen: they keep one half.
+# Weights of a logistic model on the logarithms of the evidence; `certain` is the log-odds without any evidence.
+# Fitted by `fit_weights` of tests/benchmarks/reliability.py on 72 scans. Fitted on one half and tested on the other,
+# the Brier score is 0.16; a constant guess has 0.22. Inverted triangles were too rare to fit, so their weight stays
+# 0.5.
 WEIGHTS = {"certain": 1.61, "missed": 0.77, "distance": 0.53, "unseen": 2.51, "stretch": 0.51, "inverted": 0.5,
            "limbs": 0.65}
 EVIDENCE = tuple(WEIGHTS)[1:]
@@ -44,12 +45,12 @@ class ScanFigures:
     converged: bool
     removed: float = 0.0    # share of the scan's points that were cleaned off before
     seconds: float = np.nan         # in `times.csv`, as it is the one figure that differs from run to run
-    rolled: bool = False    # limbs are rolled otherwise than they were found first, as no person's lie so
-    doubts: tuple[PlausibilityIssue, ...] = ()  # in `limbs.csv`: what no person can do, the gravest first
+    rolled: bool = False    # limbs were re-rolled because their first roll was anatomically implausible
+    doubts: tuple[PlausibilityIssue, ...] = ()  # in `limbs.csv`: what no person can do, worst first
 
 
 def figures_of(name: str, init: str, template: Mesh, fit: Registration) -> ScanFigures:
-    """How well a template lies on a scan of some name; `init` is what led it there."""
+    """Compute the quality figures of one registration; `init` says how the template was initialised."""
     return ScanFigures(
         name, init, float(np.nanmean(fit.distances)) if fit.seen.any() else np.nan, fit.rms,
         float(fit.seen.mean()), float(fit.confidence.mean()), fit.uncovered,
@@ -62,9 +63,9 @@ _READ: dict[str, Callable[[str], Any]] = {"str": str, "float": lambda text: np.n
 
 
 def read_figures(folder: Path) -> list[ScanFigures]:
-    """The figures of all scans of a set, as they stand in its tables; ValueError for other columns or values."""
+    """Read the figures of all scans of a set from its tables; ValueError for other columns or values."""
     seconds = {row["name"]: float(row["seconds"]) for row in _read(folder / TIMES)}
-    earlier = {"guide": "init", "flipped": "inverted"}  # names of columns in tables written before
+    earlier = {"guide": "init", "flipped": "inverted"}  # column names of earlier versions
     rows = [{earlier.get(name, name): text for name, text in row.items()} for row in _read(folder / FIGURES)]
     try:
         return [ScanFigures(**{f.name: _READ[str(f.type)](row[f.name]) for f in _TABLED if f.name in row},
@@ -87,12 +88,12 @@ def _as_cell(value: Any) -> Any:
 
 
 def read_failures(folder: Path) -> dict[str, str]:
-    """The scans that could not be registered when they were tried last, and why, in one line."""
+    """Read which scans could not be registered at the last attempt, and the reason of each in one line."""
     return {row["name"]: row["reason"] for row in _read(folder / FAILURES)}
 
 
 def write_failures(folder: Path, failures: Mapping[str, str]) -> None:
-    """Write the table of failures, sorted by name; without any there is none."""
+    """Write the table of failures, sorted by name; without failures the file is removed."""
     if failures:
         tables.write_table(folder / FAILURES, ["name", "reason"], sorted(failures.items()))
     else:
@@ -100,17 +101,17 @@ def write_failures(folder: Path, failures: Mapping[str, str]) -> None:
 
 
 def read_doubts(folder: Path) -> dict[str, list[PlausibilityIssue]] | None:
-    """What in each scan no person can do, the gravest first; None for a template that is no person."""
+    """Read what is implausible in each scan, worst first; None for a template that is no person."""
     if not (folder / LIMBS).exists():
         return None
-    found: dict[str, list[PlausibilityIssue]] = {}
+    doubts: dict[str, list[PlausibilityIssue]] = {}
     for row in _read(folder / LIMBS):
-        found.setdefault(row["name"], []).append(PlausibilityIssue(float(row["excess"]), row["reason"]))
-    return found
+        doubts.setdefault(row["name"], []).append(PlausibilityIssue(float(row["excess"]), row["reason"]))
+    return doubts
 
 
 def write_doubts(folder: Path, doubts: Mapping[str, Iterable[PlausibilityIssue]]) -> None:
-    """Write the table of what no person can do, sorted by name."""
+    """Write the table of implausible limbs, sorted by name."""
     tables.write_table(folder / LIMBS, ["name", "excess", "reason"],
                        [(name, f"{doubt.excess:.3f}", doubt.words) for name in sorted(doubts)
                         for doubt in doubts[name]])
@@ -122,7 +123,7 @@ def _read(path: Path) -> list[dict[str, str]]:
 
 @dataclass(frozen=True)
 class Limits(Settings):
-    """Where a figure of a registration begins to be suspect.
+    """Thresholds from which a figure of a registration is suspect.
 
     Lengths are multiples of the template's size, the square root of its area (1.4 m for a man), so that they hold
     for hands and horses too.
@@ -151,7 +152,7 @@ class Limits(Settings):
         that alone.
     """
 
-    # Of 24 synthetic people that are registered right, the median and the most: missed 0.0004, 0.010; distance 0.00065,
+    # Median and maximum over 24 correctly registered synthetic people: missed 0.0004, 0.010; distance 0.00065,
     # 0.00067; stretch 0.001, 0.009; landmarks 0.0015, 0.0018; none inverted. A real one that is 20 mm off has stretch
     # 0.047; with sides exchanged, missed 0.13 and stretch 0.10.
     missed: float = 0.005
@@ -167,7 +168,7 @@ class Limits(Settings):
 
 @dataclass(frozen=True)
 class Verdict:
-    """What is to be thought of one scan."""
+    """The verdict on one registered scan."""
 
     name: str
     badness: float                  # the largest multiple of a limit; from 1 on it needs a look; infinite: it failed
@@ -194,14 +195,16 @@ class Verdict:
 def review(figures: Sequence[ScanFigures], failures: Mapping[str, str], size: float, faces: int,
            limits: Limits | None = None, doubts: Mapping[str, Sequence[PlausibilityIssue]] | None = None,
            usual: float | None = None) -> list[Verdict]:
-    """Verdicts on all scans, worst first; `size` of the template in metres, the number of its `faces`.
+    """Judge all scans, worst first.
 
-    `doubts` are what in each scan no person can do; `usual` is the share of vertices that scanners leave without data,
-    the median of these scans if not given.
+    `size` is that of the template in metres, `faces` the number of its triangles. `doubts` lists per scan what no
+    person can do. `usual` is the share of vertices that scanners leave without data, by default the median of these
+    scans.
     """
     limits = limits or Limits()
     if usual is None:
         usual = float(np.median([1 - f.seen for f in figures])) if figures else 0.0
+    # scans that failed come first, then the others by how far they are over a limit
     known = {f.name: f for f in figures}
     verdicts = [Verdict(name, np.inf, (reason,), known.get(name)) for name, reason in sorted(failures.items())]
     judged = [_judge(f, size, faces, usual, limits, None if doubts is None else doubts.get(f.name, ()))
@@ -213,7 +216,7 @@ def review(figures: Sequence[ScanFigures], failures: Mapping[str, str], size: fl
 def evidence_of(f: ScanFigures, size: float, faces: int, usual: float, limits: Limits,
                 doubts: Sequence[PlausibilityIssue]
                 ) -> dict[str, float]:
-    """The evidence against a registration: each figure as a multiple of its limit, by the names of the limits.
+    """Compute the evidence against a registration: each figure as a multiple of its limit, by the names of the limits.
 
     `size` of the template in metres, the number of its `faces`, and the share of vertices that is `usual` without data.
     Doubts count together. What has no value is 0.
@@ -227,9 +230,9 @@ def evidence_of(f: ScanFigures, size: float, faces: int, usual: float, limits: L
 
 
 def probability_right(evidence: Mapping[str, float]) -> float:
-    """How likely a person's registration is within 20 mm on average, and no part beyond 50 mm.
+    """Estimate the probability that a registration is within 20 mm on average, with no part beyond 50 mm.
 
-    A logistic model of the logarithms of one plus each multiple of `evidence_of`; no evidence can speak for it.
+    A logistic model of log(1 + evidence). Evidence can only lower the probability.
 
     Examples
     --------
@@ -243,24 +246,26 @@ def probability_right(evidence: Mapping[str, float]) -> float:
 def _judge(f: ScanFigures, size: float, faces: int, usual: float, limits: Limits,
            doubts: Sequence[PlausibilityIssue] | None
            ) -> Verdict:
-    found = evidence_of(f, size, faces, usual, limits, doubts or ())
-    right = np.nan if doubts is None else probability_right(found) if f.seen else 0.0
-    # share of a scan off the template that may be a second person, who is half of it
+    """Judge one scan: the reasons over their limits, worst first, and the probability that it is right."""
+    evidence = evidence_of(f, size, faces, usual, limits, doubts or ())
+    right = np.nan if doubts is None else probability_right(evidence) if f.seen else 0.0
+    # every reason in words with its multiple of the limit; more than 0.3 off the template may be a second person,
+    # who would be half of the scan
     over = {
         f"{100 * f.missed:.1f}% of the scan lies off the template: "
-        + ("a second person, or clutter?" if f.missed > 0.3 else "an uncovered limb, or clutter"): found["missed"],
-        f"{1000 * f.distance:.1f} mm from the scan on average": found["distance"],
+        + ("a second person, or clutter?" if f.missed > 0.3 else "an uncovered limb, or clutter"): evidence["missed"],
+        f"{1000 * f.distance:.1f} mm from the scan on average": evidence["distance"],
         f"{100 * (1 - f.seen):.0f}% without data, {100 * usual:.0f}% is usual here: a part of the body, or one view?":
-            found["unseen"],
-        f"{100 * f.stretch:.1f}% of the surface stretched or shrunk to the double or half": found["stretch"],
-        f"{number_of(f.inverted, 'triangle')} inverted": found["inverted"],
-        f"landmarks {1000 * f.landmarks:.0f} mm off": found["landmarks"],
-        "not converged": found["not_converged"],
+            evidence["unseen"],
+        f"{100 * f.stretch:.1f}% of the surface stretched or shrunk to the double or half": evidence["stretch"],
+        f"{number_of(f.inverted, 'triangle')} inverted": evidence["inverted"],
+        f"landmarks {1000 * f.landmarks:.0f} mm off": evidence["landmarks"],
+        "not converged": evidence["not_converged"],
         "nowhere near the scan": 0.0 if f.seen else 100.0,
         **{doubt.words: doubt.excess / limits.limbs for doubt in doubts or ()}}
     reasons = sorted((reason for reason, value in over.items() if value >= 1), key=lambda reason: -over[reason])
     badness = max(over.values())
-    # several figures near their limits may say together what none says alone
+    # several figures just below their limits can together make a registration doubtful
     if not reasons and right < limits.right:
         reasons, badness = [f"all figures together leave {100 * right:.0f}% that it is right within 20 mm"], 1.0
     return Verdict(f.name, badness, tuple(reasons), f, right)

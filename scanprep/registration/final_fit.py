@@ -1,9 +1,13 @@
-"""The last pass of a registration: the surface follows the scan below its noise, evenly stretched and without folds.
+"""The last pass of a registration: the surface follows the scan to its noise, evenly stretched and without folds.
 
-Rounds of three steps: measure how every triangle has rotated and stretched; smooth that field, so that folds and
-needles, which differ from their surroundings, vanish from it; lay the triangles out as the smooth field says while
-the data draw the surface across, but not along itself. Growth that varies smoothly costs nothing, so other people
-are as welcome as other poses, and where there are no data the template continues as its surroundings rotated it.
+Each round has three steps:
+
+1. Measure how every triangle has rotated and stretched.
+2. Smooth that field. Folds and needles differ from their surroundings, so they vanish.
+3. Solve for vertices that follow the smooth field, while the data pull them along the surface normal.
+
+Stretch that varies smoothly costs nothing, so other body shapes are as easy as other poses. Where there are no data the
+template continues as its surroundings rotated it.
 """
 from __future__ import annotations
 
@@ -25,7 +29,7 @@ from .stretches import Field, gradient_operator
 
 @dataclass(frozen=True, eq=False)
 class FinalFit:
-    """Where the surface came to lie: vertices (N, 3), metres, and which of them, seen (N,), had data."""
+    """The fitted surface: vertices (N, 3), metres, and which of them, seen (N,), had data."""
 
     vertices: np.ndarray
     seen: np.ndarray
@@ -40,19 +44,24 @@ class FinalFit:
 
 def final_fit(template: Mesh, start: np.ndarray, target: Target,
               landmarks: tuple[np.ndarray, np.ndarray] | None = None, config: FinalFitConfig | None = None) -> FinalFit:
-    """A template whose vertices (N, 3) lie near a scan, on it; landmarks are vertices (L,) and places (L, 3)."""
+    """Fit a template that already lies near a scan, vertices (N, 3), to its surface.
+
+    Landmarks are vertices (L,) of the template and points (L, 3) of the scan.
+    """
     config = config or FinalFitConfig()
     surface = _SurfaceFit(template, start, target, landmarks, config)
     x, before, stiff = start, start, np.ones(len(template.faces))
+    # measure, smooth and solve; each round starts from the result of the last
     for stage in config.rounds:
         x, before = surface.lay_out(x, surface.fields(x, stage)[1], stage, stiff), x
-    # repairs: triangles around folds and needles resist more and more
+    # repairs: around folds and needles the smooth field gets four times the weight each time, at most twelve times
     for repairs in range(13):
         measured, smooth = surface.fields(x, stage)
         n = template.face_normals[..., None]
         inverted = np.einsum("fdk,fdk->f", measured.R @ n, smooth.R @ n) < 0
         relative = measured.gradient @ np.linalg.inv(smooth.gradient)
         stretches = np.maximum(np.linalg.eigvalsh(relative.transpose(0, 2, 1) @ relative), 1e-12)       # their squares
+        # a needle is stretched or squeezed four times more than the smooth field around it says
         needles = (stretches[:, 2] > 4**2) | (stretches[:, 0] < 1 / 4**2)
         if repairs == 12 or not (inverted | needles).any():
             break
@@ -60,6 +69,7 @@ def final_fit(template: Mesh, start: np.ndarray, target: Target,
         near[template.faces[inverted | needles]] = 1
         stiff = np.where(near[template.faces].any(axis=1), 4 * stiff, stiff)
         x, before = surface.lay_out(x, smooth, stage, stiff), x
+    # report RMS log-stretch over the area, absolute and against the smooth field
     strain, roughness = (float(np.sqrt(np.average(square, weights=surface.triangles.areas)))
                          for square in ((measured.log_S**2).sum(axis=(1, 2)) / 3,
                                         (0.25 * np.log(stretches)**2).mean(axis=1)))
@@ -83,34 +93,39 @@ class SmoothedScan:
 
 
 def smooth_scan(target: Target, width: float, neighbours: int = 40) -> SmoothedScan:
-    """A scan with a quadratic surface fitted around every point; others count by a Gaussian of `width` metres."""
+    """Denoise a scan: fit a quadratic surface around every point, with Gaussian weights of `width` metres."""
     P, n = target.points, target.normals
     apart, near = cKDTree(P).query(P, min(neighbours, len(P)), workers=search_threads(len(P)))
-    # two thousand points at once: their neighbours fit into the cache
-    some = (slice(first, first + 2000) for first in range(0, len(P), 2000))
-    fitted = [_fit_surfaces(P[at], n[at], P[near[at]], n[near[at]], apart[at], width) for at in some]
+    # two thousand points at a time: their neighbours fit into the cache
+    blocks = (slice(first, first + 2000) for first in range(0, len(P), 2000))
+    fitted = [_fit_surfaces(P[at], n[at], P[near[at]], n[near[at]], apart[at], width) for at in blocks]
     points, normals, rest = (np.concatenate(part) for part in zip(*fitted, strict=True))
+    # the fourth neighbour is steadier than the first where views overlap
     spacing = np.median(apart[:, min(4, apart.shape[1] - 1)])
     return SmoothedScan(points, normals, target.border, float(np.sqrt(np.median(rest))), float(spacing))
 
 
 def _fit_surfaces(P: np.ndarray, n: np.ndarray, near: np.ndarray, near_n: np.ndarray, apart: np.ndarray,
-                     width: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Points and normals (m, 3) moved to the quadratic surface through their neighbours (m, k, 3).
+                  width: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Move points and normals (m, 3) to the quadratic surface through their neighbours (m, k, 3).
 
-    And the mean square (m,), square metres, of what lies beside these surfaces.
+    Returns points, normals, and the mean squared residual (m,), square metres, of each fit.
     """
+    # near neighbours that face the same way count most
     w = np.exp(-0.5 * (apart / width) ** 2) * np.maximum(np.matmul(near_n, n[..., None])[..., 0], 0)
+    # local axes at every point: two tangents and the normal; u, v in the plane, h the height above it
     side = np.cross(n, np.eye(3)[np.argmin(np.abs(n), axis=1)])
     side /= np.linalg.norm(side, axis=1, keepdims=True)
     axes = np.stack([side, np.cross(n, side), n], axis=1)
     u, v, h = np.moveaxis(np.matmul((near - P[:, None]) / width, axes.transpose(0, 2, 1)), 2, 0)
+    # weighted least squares for h = c0 + c1 u + c2 v + c3 u² + c4 uv + c5 v²
     basis = np.stack([np.ones_like(u), u, v, u * u, u * v, v * v], axis=1)
     weighed = basis * w[:, None]
     normal = np.matmul(weighed, basis.transpose(0, 2, 1))
-    # Few points say little about curvature: near borders the fit falls back to a plane.
+    # ridge on slopes and curvatures: with few points, near borders, the fit falls back to a plane
     normal += np.diag([1e-9, 1e-2, 1e-2, 0.3, 0.3, 0.3])
     fit = np.linalg.solve(normal, np.matmul(weighed, h[..., None]))
+    # the fitted height moves the point, the slopes tilt the normal, the residual is noise
     rest = np.matmul(fit.transpose(0, 2, 1), basis)[:, 0] - h
     normals = n - fit[:, 1] * axes[:, 0] - fit[:, 2] * axes[:, 1]
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
@@ -119,24 +134,27 @@ def _fit_surfaces(P: np.ndarray, n: np.ndarray, near: np.ndarray, near_n: np.nda
 
 
 class _SurfaceFit:
-    """The template, where it began, the scan, and what holds it everywhere."""
+    """What the rounds of the final fit share: template, start, denoised scan, and pulls to start and landmarks."""
 
     def __init__(self, template: Mesh, start: np.ndarray, target: Target,
                  landmarks: tuple[np.ndarray, np.ndarray] | None, config: FinalFitConfig) -> None:
         size, N = float(np.sqrt(template.face_areas.sum())), len(start)
         self.template, self.start, self.config, self.size = template, start, config, size
         self.triangles = gradient_operator(template)
+        # degenerate triangles get a thousandth of the mean area, so that no equation vanishes
         self.areas = np.maximum(template.vertex_areas, 1e-3 * template.vertex_areas.mean())
         target = orient_by_mesh(target, template.with_vertices(start), NORMALS * size)
         self.scan = smooth_scan(target, config.noise_width * size)
+        # a pull to the start of 1e-9 keeps the equations regular without moving anything
         self.held = pull(N, np.arange(N), start, 1e-9 * self.areas)
         if landmarks is not None:
             self.held += pull(N, *landmarks, np.full(len(landmarks[0]), config.landmarks * size**2))
 
     def fields(self, x: np.ndarray, stage: FinalFitRound) -> tuple[Field, Field]:
-        """The field of rotations and stretches measured, and the smooth one, in which what disagrees counts little."""
+        """Measure the field of rotations and stretches, and smooth it robustly."""
         measured = self.triangles.measure(x)
         weights = np.ones(len(self.template.faces))
+        # reweighted twice: triangles off the smooth field by more than about 0.5 count little
         for _ in range(2):
             smooth = self.triangles.smooth(measured, stage.field * self.size, weights)
             off = np.linalg.norm(measured.gradient - smooth.gradient, axis=(1, 2))
@@ -144,10 +162,10 @@ class _SurfaceFit:
         return measured, smooth
 
     def data(self, x: np.ndarray, reach: float) -> tuple[QuadraticTargets, np.ndarray]:
-        """Vertices drawn to the tangent planes of the nearest smoothed points with like normals, and which (N,) are."""
+        """Return pulls to the tangent planes of the nearest denoised points, and which vertices (N,) have data."""
         reach, scan, body = reach * self.size, self.scan, self.template.with_vertices(x)
         found = OrientedPoints(scan.points, scan.normals, NORMALS * self.size).match(x, body.vertex_normals, reach)
-        # At the edge of a hole a point speaks for its own neighbourhood, not for what lies beyond the edge.
+        # a border point counts only for vertices beside it, not for vertices beyond the edge of the hole
         beside = np.linalg.norm(np.cross(scan.normals[found.index], x - scan.points[found.index]), axis=1)
         seen = found.valid & (~scan.border[found.index] | (beside <= scan.spacing))
         v = np.flatnonzero(seen)
@@ -156,11 +174,12 @@ class _SurfaceFit:
         return pull(len(x), v, scan.points[p], weights, scan.normals[p], self.config.slide), seen
 
     def lay_out(self, x: np.ndarray, smooth: Field, stage: FinalFitRound, stiff: np.ndarray) -> np.ndarray:
-        """Vertices that come nearest to the smooth field of gradients and to what the data want of them."""
+        """Solve for the vertices (N, 3) that best agree with the smooth gradients, the data and the landmarks."""
         wanted, seen = self.data(x, stage.reach)
-        # Rounds of smoothing would straighten a limb that nothing holds: there the start is all that is known.
+        # without data, smoothing would straighten a bent limb: there a weak pull keeps the start
         wanted = wanted + self.held + pull(len(x), np.arange(len(x)), self.start, self.config.stay * ~seen * self.areas)
         weights = (stage.tension * self.size)**2 * self.triangles.areas * stiff
+        # Poisson-type system K x + A x = force; preconditioned by K plus the largest eigenvalue of each block A
         K = self.triangles.stiffness(weights)
         across = np.linalg.eigvalsh(wanted.A)[:, 2]
         nearly = Factored(csc_array(K + diags_array(across)))

@@ -1,7 +1,7 @@
-"""What a deformation graph resists and what draws it: terms with their value and what they add to the normal equations.
+"""Energy terms of a deformation graph: each with its value and its part of the normal equations.
 
-All energies are areas times squared lengths, so their balance does not depend on how finely template, graph or scan are
-divided.
+All energies are areas times squared lengths. Their balance does not depend on how finely template, graph or scan are
+sampled.
 """
 from __future__ import annotations
 
@@ -18,24 +18,26 @@ from .deformation_graph import DeformationGraph, NodeMotion, arms
 from .matches import QuadraticTargets
 from .schedule import GraphStage
 
-UNKNOWNS = 7
+UNKNOWNS = 7         # of a node: rotation (3), log-scale (1), translation (3)
 
 
 class NodePattern:
-    """Where the normal matrix of a graph has blocks, and which block every vertex and edge adds to."""
+    """Sparsity of the normal matrix of a graph: which blocks exist, and which block every vertex and edge adds to."""
 
     def __init__(self, graph: DeformationGraph) -> None:
         M, K = len(graph.node_vertices), graph.carriers.shape[1]
         i, j = graph.edges.T
+        # a block (i, j) has the key i M + j: pairs of nodes that carry a vertex, ends of edges, and the diagonal
         of_vertices = (graph.carriers[:, :, None] * M + graph.carriers[:, None, :]).reshape(-1)
         of_edges = np.concatenate([i * M + i, i * M + j, j * M + i, j * M + j])
         keys, where = np.unique(np.concatenate([of_vertices, of_edges, np.arange(M) * (M + 1)]),
                                 return_inverse=True)
         self.nodes = M
         self.rows, self.columns = keys // M, keys % M
+        # the order of entries is found once, so that `matrix` only copies values
         blocks = bsr_array((np.arange(len(keys) * UNKNOWNS**2).reshape(-1, UNKNOWNS, UNKNOWNS), self.columns,
                             np.searchsorted(self.rows, np.arange(M + 1))), shape=(M * UNKNOWNS, M * UNKNOWNS))
-        self._entries = csc_array(blocks)            # of every entry its place in the blocks
+        self._entries = csc_array(blocks)            # the place of every entry in the blocks
         self.vertex_slots = where[:len(of_vertices)].reshape(-1, K * K)
         edge_slots = where[len(of_vertices):len(of_vertices) + len(of_edges)].reshape(4, -1)
         self._gather = {count: (gatherer(edge_slots[:, :count].reshape(-1), len(keys)),
@@ -43,17 +45,17 @@ class NodePattern:
                         for count in (len(graph.edges), len(graph.edges) // 2)}
 
     def of_edges(self, blocks: np.ndarray, forces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Blocks (P, 7, 7) and half the gradient (M, 7) of all nodes from those of edges, or of their first half.
+        """Sum blocks (P, 7, 7) and half the gradient (M, 7) over all edges, or over their first half.
 
-        Of every edge the blocks (4, E, 7, 7) join the first node with itself, with the second, the second with the
-        first and with itself; the forces (2, E, 7) are on the first and the second.
+        The blocks (4, E, 7, 7) of every edge are those of its node pairs (i, i), (i, j), (j, i), (j, j). The forces
+        (2, E, 7) act on its first and its second node.
         """
         to_blocks, to_nodes = self._gather[blocks.shape[1]]
         return (sum_groups(to_blocks, blocks.reshape(-1, UNKNOWNS, UNKNOWNS)),
                 sum_groups(to_nodes, forces.reshape(-1, UNKNOWNS)))
 
     def matrix(self, blocks: np.ndarray) -> csc_array:
-        """The sparse symmetric matrix of all blocks (P, 7, 7)."""
+        """Assemble the sparse symmetric matrix of all blocks (P, 7, 7)."""
         entries = self._entries
         return csc_array((blocks.reshape(-1)[entries.data], entries.indices, entries.indptr), shape=entries.shape)
 
@@ -71,9 +73,9 @@ class Term(NamedTuple):
 
 
 def _edge_term(r: np.ndarray, w: np.ndarray, jacobians: Callable[[], tuple[np.ndarray, np.ndarray]]) -> Term:
-    """`Σ w |r|²` over the edges of a graph, or their first half, for residuals r (E, d) with weights w (E,).
+    """Build the term `Σ w |r|²` over the edges of a graph, or their first half: residuals r (E, d), weights w (E,).
 
-    The Jacobians (E, d, 7) are by the unknowns of the first and of the second node.
+    The Jacobians (E, d, 7) are with respect to the unknowns of the first and of the second node.
     """
     def normal(pattern: NodePattern) -> tuple[np.ndarray, np.ndarray]:
         Ji, Jj = jacobians()
@@ -85,7 +87,8 @@ def _edge_term(r: np.ndarray, w: np.ndarray, jacobians: Callable[[], tuple[np.nd
 
 
 def match_term(graph: DeformationGraph, motion: NodeMotion, wanted: QuadraticTargets) -> Term:
-    """What matches and landmarks ask of the nodes that carry the vertices."""
+    """Build the data term: squared distances of vertices to their matches and landmarks."""
+    # vertices without a match or landmark add nothing
     active = np.flatnonzero(np.einsum("nii->n", wanted.A) > 0)
     A, b = wanted.A[active], wanted.b[active]
     w, carriers = graph.weights[active], graph.carriers[active]
@@ -95,11 +98,13 @@ def match_term(graph: DeformationGraph, motion: NodeMotion, wanted: QuadraticTar
 
     def normal(pattern: NodePattern) -> tuple[np.ndarray, np.ndarray]:
         n, K = w.shape
+        # Jacobian of a vertex by each of its K nodes: -[y]x for a rotation, y for the log-scale, I for a translation
         J = np.empty((n, 3, K, UNKNOWNS))
         J[..., :3] = -rotations.hat(y).transpose(0, 2, 1, 3)
         J[..., 3] = y.transpose(0, 2, 1)
         J[..., 4:] = np.eye(3)[:, None]
         J *= w[:, None, :, None]
+        # Gauss-Newton: JᵀAJ goes to the pairs of nodes that carry the vertex, Jᵀ(Ax - b) to the nodes
         flat = J.reshape(n, 3, K * UNKNOWNS)
         blocks = np.matmul(flat.transpose(0, 2, 1), np.matmul(A, flat)).reshape(n, K, UNKNOWNS, K, UNKNOWNS)
         force = np.matmul(flat.transpose(0, 2, 1), (Ax - b)[..., None]).reshape(n * K, UNKNOWNS)
@@ -111,7 +116,7 @@ def match_term(graph: DeformationGraph, motion: NodeMotion, wanted: QuadraticTar
 
 
 def stretch_term(graph: DeformationGraph, motion: NodeMotion, stiffness: float) -> Term:
-    """Every node wants to see its neighbours where its own rotation and growth would put them.
+    """Build the stretch term: every node predicts where its neighbours are by its own rotation and growth [Hahnel].
 
     A strain of one costs as much as `stiffness` metres from the data.
     """
@@ -131,7 +136,7 @@ def stretch_term(graph: DeformationGraph, motion: NodeMotion, stiffness: float) 
 
 
 def bend_term(graph: DeformationGraph, motion: NodeMotion, stiffness: float) -> Term:
-    """Neighbours want to rotate alike: one radian between them costs as much as `stiffness` metres from the data."""
+    """Build the bending term between neighbours: one radian costs as much as `stiffness` metres from the data."""
     i, j = graph.links.T
     r = rotations.log(motion.R[j] @ motion.R[i].transpose(0, 2, 1))
 
@@ -145,7 +150,7 @@ def bend_term(graph: DeformationGraph, motion: NodeMotion, stiffness: float) -> 
 
 
 def growth_term(graph: DeformationGraph, motion: NodeMotion, stiffness: float) -> Term:
-    """Neighbours want to grow alike: a factor of e between them costs as much as `stiffness` metres from the data."""
+    """Build the growth term between neighbours: a factor of e costs as much as `stiffness` metres from the data."""
     i, j = graph.links.T
 
     def jacobians() -> tuple[np.ndarray, np.ndarray]:
@@ -158,7 +163,7 @@ def growth_term(graph: DeformationGraph, motion: NodeMotion, stiffness: float) -
 
 def terms(graph: DeformationGraph, motion: NodeMotion, wanted: QuadraticTargets, stage: GraphStage, size: float
           ) -> dict[str, Term]:
-    """All terms of the energy at one state, on a template of some size, metres."""
+    """Return all terms of the energy at one state; `size` of the template in metres."""
     return {"data": match_term(graph, motion, wanted),
             "stretch": stretch_term(graph, motion, stage.stretch * size),
             "bend": bend_term(graph, motion, stage.bend * size),

@@ -1,6 +1,6 @@
-"""The coarse registration: a deformation graph is drawn to the scan by matches in both directions, stage by stage.
+"""The coarse registration: a deformation graph is pulled to the scan by matches in both directions, stage by stage.
 
-Rotations of nodes are unknowns, so limbs keep their volume where there are no data.
+Rotations of nodes are unknowns. So limbs keep their volume where there are no data.
 
 [Hahnel]
 """
@@ -27,20 +27,20 @@ from .schedule import GraphStage, RegistrationConfig
 
 @dataclass(frozen=True, eq=False)
 class GraphFit(Fit):
-    """A template where the nodes of a graph carry it."""
+    """A fit whose vertices are carried by the nodes of a graph."""
 
     graph: DeformationGraph = field(kw_only=True)
     motion: NodeMotion = field(kw_only=True)
 
     def refine(self, template: Mesh, nodes: int) -> GraphFit:
-        """The same motion on a graph of so many nodes."""
+        """Return the same motion on a graph of `nodes` nodes."""
         if min(nodes, len(self.x)) == len(self.graph.node_vertices):
             return self
         finer = build_graph(template, nodes)
         return replace(self, graph=finer, motion=refine_motion(self.graph, self.motion, finer))
 
     def minimise(self, wanted: QuadraticTargets, stage: GraphStage, size: float, steps: int) -> GraphFit:
-        """The fit nearer to what matches and landmarks want, against the resistance of the nodes of a stage."""
+        """Move the nodes towards matches and landmarks, against the stiffness of a stage, by Levenberg-Marquardt."""
         if not wanted.A.any():
             return self
         pattern = node_pattern(self.graph)
@@ -51,22 +51,28 @@ class GraphFit(Fit):
             def assemble() -> tuple[np.ndarray, csc_array]:
                 normals = (term.normal(pattern) for term in now.values())
                 blocks, half = (reduce(np.add, parts) for parts in zip(*normals, strict=True))
+                # growth 0 fixes the size of nodes: without equations the damping keeps the log-scale where it is
                 if not stage.growth:
-                    blocks[:, 3], blocks[:, :, 3], half[:, 3] = 0, 0, 0               # the log-scale
+                    blocks[:, 3], blocks[:, :, 3], half[:, 3] = 0, 0, 0  # the log-scale
                 return half.reshape(-1), pattern.matrix(blocks)
 
             values = {name: term.value for name, term in now.items()}
             return Sparse(sum(values.values()), assemble, values)
 
-        found = levenberg_marquardt(equations, self.motion, steps, tolerance=1e-3, damping=1e-5,
-                                    retract=lambda at, step: at.advance(step.reshape(-1, UNKNOWNS)))
-        return replace(self, x=deform(self.graph, found.x), motion=found.x, energies=found.equations.terms,
-                       iterations=self.iterations + found.iterations)
+        # a tolerance of 1e-3 is enough, as matches are sought anew after each minimisation
+        solution = levenberg_marquardt(equations, self.motion, steps, tolerance=1e-3, damping=1e-5,
+                                       retract=lambda at, step: at.advance(step.reshape(-1, UNKNOWNS)))
+        return replace(self, x=deform(self.graph, solution.x), motion=solution.x, energies=solution.equations.terms,
+                       iterations=self.iterations + solution.iterations)
 
 
 def register_graph(inputs: RegistrationProblem, start: np.ndarray, config: RegistrationConfig,
                    progress: Callable[[int, int], None]) -> GraphFit:
-    """The template bent onto the scan by the stages of the schedule, from vertices by those near; see `Method`."""
+    """Deform the template onto the scan by the stages of the schedule; from vertices, only by the near stages.
+
+    See `Method`.
+    """
+    # a start by vertices needs no stage that matches by paths; without path descriptors these stages are skipped
     near = start.shape == inputs.template.vertices.shape
     stages = config.near_stages if near else [
         stage for stage in config.graph if stage.positions == 1 or inputs.descriptors is not None]
@@ -76,14 +82,14 @@ def register_graph(inputs: RegistrationProblem, start: np.ndarray, config: Regis
 
 
 def fit_at_vertices(template: Mesh, vertices: np.ndarray, nodes: int) -> GraphFit:
-    """The template where nodes carry it nearest to vertices (N, 3), on a graph of so many nodes."""
+    """Return the fit of a graph of `nodes` nodes that comes nearest to vertices (N, 3)."""
     graph = build_graph(template, nodes)
     motion = motion_of(graph, vertices)
     return GraphFit(deform(graph, motion), graph=graph, motion=motion)
 
 
 def start_fit(template: Mesh, T: np.ndarray, nodes: int) -> GraphFit:
-    """The template where a rigid transform (4, 4) places it, on a graph of so many nodes."""
+    """Return the fit of a graph of `nodes` nodes after a rigid transform (4, 4)."""
     graph, R, t = build_graph(template, nodes), T[:3, :3], T[:3, 3]
     M = len(graph.nodes)
     motion = NodeMotion(np.broadcast_to(R, (M, 3, 3)).copy(), np.zeros(M), graph.nodes @ R.T + t)
@@ -92,20 +98,21 @@ def start_fit(template: Mesh, T: np.ndarray, nodes: int) -> GraphFit:
 
 def fit_stages(inputs: RegistrationProblem, fit: GraphFit, stages: list[GraphStage],
                progress: Callable[[int, int], None] = lambda done, total: None) -> GraphFit:
-    """The fit after some stages, and after ends of the body were tried in other rotations where a stage says so."""
+    """Run some stages, and try other rotations of head, hands and feet where a stage asks for it."""
     done, total = 0, sum(stage.rounds for stage in stages)
     for stage in stages:
         before, fit = fit, fit_stage(inputs, fit, stage)
         fit = replace(fit, moved=float(np.linalg.norm(fit.x - before.x, axis=1).mean()))
         done += stage.rounds
         progress(done, total)
+        # an end has a radius of 0.14 of the body's size, about that of a head or a hand with its wrist
         for end in find_ends(inputs.template, stage.ends, 0.14 * inputs.size) if stage.ends else ():
             fit = rotate_end(inputs, fit, stage, end)
     return fit
 
 
 def fit_stage(inputs: RegistrationProblem, fit: GraphFit, stage: GraphStage) -> GraphFit:
-    """The fit after matches were sought and followed, as often as the stage says."""
+    """Run one stage: find matches and minimise, as often as the stage says."""
     cell, template = stage.detail * inputs.size, inputs.template
     target, sample = inputs.target.thin(cell), thin(template.vertices, cell)
     fit = fit.refine(template, stage.nodes)
@@ -115,10 +122,10 @@ def fit_stage(inputs: RegistrationProblem, fit: GraphFit, stage: GraphStage) -> 
 
 
 def rotate_end(inputs: RegistrationProblem, fit: GraphFit, stage: GraphStage, end: End) -> GraphFit:
-    """The fit with an end of the body rotated about itself, where that lies nearer to the scan and needs less bending.
+    """Try an end of the body in other rotations; keep the one that lies nearer to the scan and bends its skin less.
 
-    A head or a hand that is rolled wrongly lies on the scan as well, but must change its shape for it. The joint above
-    may bend, so what counts is how far the end is from an enlarged copy of itself.
+    A twisted head or hand lies on the scan as well, but must change its shape for it. The joint above may bend. So what
+    counts is how far the end is from a scaled rigid copy of itself.
     """
     size, template = inputs.size, inputs.template
     target = inputs.target.thin(0.5 * stage.detail * size)
@@ -127,15 +134,16 @@ def rotate_end(inputs: RegistrationProblem, fit: GraphFit, stage: GraphStage, en
     areas = template.vertex_areas
 
     def misfit(of: GraphFit) -> float:
-        """Error against the scan, both ways, strain, and twenty times what the end is bent in itself, as it is now."""
+        """Sum the error against the scan, both ways, the strain, and twenty times the bending of the end in itself."""
         body = template.with_vertices(of.x)
-        # an end that is turned into the body lies near the scan everywhere, and leaves the scan of it uncovered
+        # an end hidden inside the body is near the scan everywhere, but leaves its own scan uncovered; capped at 0.05
         left = np.minimum(cKDTree(of.x).query(target.points)[0], 0.05 * size)
         strain = sum(term.value for term in terms(of.graph, of.motion, held, stage, size).values())
         bent = 20.0 * areas[end.vertices].sum() * bending(template.vertices[end.vertices], of.x[end.vertices])[0] ** 2
         there = float(scan.error(body.vertices, body.vertex_normals) @ areas)
         return there + float((left**2).mean() * areas.sum()) + strain + bent
 
+    # from each candidate pose of the end: move the graph there, then follow the matches again
     trials = [fit]
     for places in rotate_ends(template, end, fit.x, scan):
         drawn = held + pull(len(fit.x), end.vertices, places, areas[end.vertices])

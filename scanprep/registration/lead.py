@@ -1,7 +1,8 @@
-"""What leads a template to a scan: something that finds a body on it, and where the template's vertices are then.
+"""Initialisation of a registration by a body model: it finds the body on a scan and proposes the template's vertices.
 
-The package `model` does so by a model of people, or by one of your own, and learns one from a set. It makes itself
-known by the entry points `model` and `learn` of the group `scapekit.leads`, since nothing here may import it.
+The package `model` does this with the built-in people or with your own model, and learns a model from a set. It is
+found by the entry points `model` and `learn` of the group `scapekit.leads`, because nothing in `scanprep` may import
+it.
 """
 from __future__ import annotations
 
@@ -18,11 +19,11 @@ from .person import PersonParts, has_limbs
 
 
 class Lead(Protocol):
-    """Finds bodies on scans: where the template's vertices (N, 3), metres, are on each, the likeliest body first.
+    """Finds bodies on scans and yields the template's vertices (N, 3), metres, on each, the likeliest body first.
 
-    The next body is sought when it is asked for: whoever is content with the first does not wait for others.
-    Landmarks are vertices (L,) of the template and points (L, 3), metres. `model` is where the file of the model lies
-    for whoever asks, if it is not where the lead was made.
+    The next body is sought only when it is asked for, so the first one comes fast.
+    Landmarks are vertices (L,) of the template and points (L, 3), metres. `model` is the path of the model file, where
+    it differs from the path the lead was made with.
     """
 
     name: str
@@ -33,20 +34,25 @@ class Lead(Protocol):
 
 
 def lead_of(template: Mesh, through: str, progress: Callable[[int, int], None] | None = None) -> Lead | None:
-    """What leads a template, or None.
+    """Load what initialises registrations of a template; None for nothing.
 
     Parameters
     ----------
     template : Mesh
+        Template to be registered.
     through : str
         "none"; "auto", the built-in people for a template that is a person, nothing for others; or the file of a model.
     progress : callable, optional
         Called as progress(done, total).
 
+    Returns
+    -------
+    Lead or None
+
     Raises
     ------
     ValueError
-        A model that cannot lead the template, and why; or a file that is none.
+        A model that does not fit the template, with the reason; or a file that is no model.
     """
     if through == "none" or (through == "auto" and not has_limbs(template)):
         return None
@@ -54,32 +60,34 @@ def lead_of(template: Mesh, through: str, progress: Callable[[int, int], None] |
 
 
 def learn_model(template: Mesh, skeleton: Skeleton, poses: np.ndarray, shapes: np.ndarray | None, path: Path) -> None:
-    """Learn a model that leads a template to more scans, and write its file.
+    """Learn a body model that initialises registrations of more scans, and write its file.
 
     Parameters
     ----------
     template : Mesh
+        Template of the registrations.
     skeleton : Skeleton
         Of the template.
     poses : (M, N, 3) float, metres
         The template on one subject in several poses.
     shapes : (S, N, 3) float, metres, or None
-        The same on others.
+        The template on other subjects.
     path : Path
+        File to write.
 
     Raises
     ------
     ValueError
-        Meshes that cannot teach, and why.
+        Meshes that a model cannot be learned from, with the reason.
     """
     _load_entry_point("learn", "a model of this set")(template, skeleton, poses, shapes, path)
 
 
 def _load_entry_point(name: str, wanted: str) -> Callable[..., Any]:
-    """What the package `model` makes known by a name; ValueError where it is not installed."""
+    """Load an entry point of the package `model` by its name; ValueError where it is not installed."""
     group = "scapekit.leads"
-    found = [entry for entry in entry_points(group=group) if entry.name == name]
-    if not found:
+    matching = [entry for entry in entry_points(group=group) if entry.name == name]
+    if not matching:
         raise ValueError(f"{wanted}: scapekit is not installed whole, nothing is known as '{group}' {name}; "
                          "install it, or leave the model out with --through none")
-    return found[0].load()
+    return matching[0].load()

@@ -1,9 +1,9 @@
 """Non-rigid registration of a template to a scan, from stiff to soft.
 
-1. The template is placed by the lengths of paths to its landmarks, whatever its pose.
-2. A graph of nodes that rotate and grow is drawn to the scan by matches in both directions, in stages of falling
-   stiffness and rising detail; rotations are unknowns, so limbs keep their volume where there are no data.
-3. The surface follows the scan below its noise, evenly stretched and without inverted triangles.
+1. Place the template by path lengths to its landmarks, whatever its pose.
+2. Pull a graph of rotating and scaling nodes to the scan by matches in both directions. Stages go from stiff to soft
+   and from coarse to fine. Rotations are unknowns, so limbs keep their volume where there are no data.
+3. Fit the surface to the scan down to its noise, evenly stretched and without inverted triangles.
 
 [Hahnel], [Allen], [Amberg]
 """
@@ -32,42 +32,68 @@ from .schedule import RegistrationConfig
 
 @dataclass(frozen=True, eq=False)
 class Registration:
-    """The template on the scan.
+    """The template on the scan, with quality figures.
 
-    `uncovered` is the share of the scan's points off the template, by more than a hundredth of its size (the root of
-    its area). More than half a per cent is a limb in the wrong place, or clutter; `converged` does not tell.
+    Attributes
+    ----------
+    mesh : Mesh
+        The template's triangles with vertices on the scan.
+    distances : (N,) float, metres
+        Distance of each vertex with data to the surface of the scan; NaN elsewhere.
+    seen : (N,) bool
+        Vertices with data: their confidence is at least one half.
+    rms : float, metres
+        RMS of the distances; NaN without data.
+    landmark_rms : float, metres
+        RMS distance of the landmarks; NaN without landmarks.
+    converged : bool
+        The last step moved the mean vertex by less than a thousandth of the template's size. False without data.
+    iterations : int
+        Steps over all stages.
+    energies : dict of str to float
+        Each energy term at the end of the coarse registration, and the strain of the final fit.
+    inverted : int
+        Triangles that face against their surroundings.
+    confidence : (N,) float
+        From 0, extrapolated from the surroundings, to 1, data here by matches in both directions.
+    uncovered : float
+        Share of the scan's points that lie more than a hundredth of the template's size (the root of its area) off it.
+        More than half a per cent is a limb in the wrong place, or clutter. `converged` does not show that.
+    rolled : bool
+        Limbs were re-rolled by `repair_limbs`.
+    soles : (float, float), metres, or None
+        How far soles were beyond the end of the scan, before and after `with_soles`.
     """
 
-    mesh: Mesh                   # the template's triangles on their new vertices
-    distances: np.ndarray        # (N,) metres, from each vertex that was seen to the surface of the scan, else NaN
-    seen: np.ndarray             # (N,) bool: there were data here, the confidence is at least one half
-    rms: float                   # metres, of the distances of the vertices seen
-    landmark_rms: float          # metres; NaN without landmarks
-    converged: bool              # never without data
-    iterations: int              # steps over all stages
-    energies: dict[str, float]   # each term at the end of the coarse registration, and of the data at the very end
-    inverted: int                # triangles that face against their surroundings
-    confidence: np.ndarray       # (N,) from 0, made up from the surroundings, to 1: data here, from both directions
+    mesh: Mesh
+    distances: np.ndarray
+    seen: np.ndarray
+    rms: float
+    landmark_rms: float
+    converged: bool
+    iterations: int
+    energies: dict[str, float]
+    inverted: int
+    confidence: np.ndarray
     uncovered: float
-    rolled: bool = False         # limbs were rolled otherwise than they were found first: see `repair_limbs`
-    soles: tuple[float, float] | None = None    # metres beyond the floor where the scan ends: see `with_soles`
+    rolled: bool = False
+    soles: tuple[float, float] | None = None
 
 
 @dataclass(frozen=True, eq=False)
 class LedRegistration:
-    """A registration without landmarks, or with few, and what led it: see `register_by_any`."""
+    """A registration without landmarks, or with few, and what initialised it: see `register_by_any`."""
 
     fit: Registration
-    way: str                                    # what led it, in words: "model people", "160 correspondences"
-    rival: LedRegistration | None = None        # another body on the scan that leaves hardly more to doubt
+    way: str                                    # what initialised it: "model people", "160 correspondences"
+    rival: LedRegistration | None = None        # another body on the scan that is almost as plausible
 
 
 class Method(Protocol):
-    """A way to bring a template near a scan, of which `METHODS` holds those that can be chosen by name.
+    """A method that brings a template near a scan; `METHODS` holds those that can be chosen by name.
 
-    It takes the inputs, the rigid transform (4, 4) or the vertices (N, 3) to begin with, the settings and a callback
-    for (done, total), and says where the template came to lie. The checks before, the last pass and the figures after
-    are the same for all.
+    It takes the inputs, the initial rigid transform (4, 4) or vertices (N, 3), the settings and a callback for
+    (done, total). It returns the deformed template. Checks, final fit and quality figures are the same for all methods.
     """
 
     def __call__(self, inputs: RegistrationProblem, start: np.ndarray, config: RegistrationConfig,
@@ -78,9 +104,9 @@ METHODS: dict[str, Method] = {"graph": register_graph}
 
 
 def translate(what: Any, by: np.ndarray) -> Any:
-    """What registrations are made of, or one itself, at another place, `by` (3,) metres away; all else stays.
+    """Translate any input or result of a registration by `by` (3,), metres; return anything else as it is.
 
-    A mesh, points (n, 3), a transform (4, 4), correspondences, and tuples of these, as landmarks are.
+    It knows meshes, registrations, points (n, 3), transforms (4, 4), correspondences, and tuples of these.
     """
     if isinstance(what, Mesh):
         return what.with_vertices(what.vertices + by)
@@ -95,7 +121,7 @@ def translate(what: Any, by: np.ndarray) -> Any:
     if np.ndim(what) != 2:
         return what
     moved = np.array(what, dtype=np.float64)
-    moved[:3, 3:] += by[:, None]                          # of a transform
+    moved[:3, 3:] += by[:, None]                          # the translation of a (4, 4) transform
     return moved if moved.shape == (4, 4) else moved + by
 
 
@@ -103,15 +129,15 @@ F = TypeVar("F", bound=Callable[..., Any])
 
 
 def near_origin(method: F) -> F:
-    """The same function of template and scan, where a scan is so far from the origin that sums lose digits, as in UTM.
+    """Decorate a function of template and scan, so that it also works far from the origin, as in UTM coordinates.
 
-    Everything but the template is brought near, and what comes out is brought back.
+    Everything but the template is moved near the origin, and the result is moved back.
     """
     @wraps(method)
     def wrapper(template: Mesh, scan: Mesh | np.ndarray, *args: Any, **named: Any) -> Any:
         points = check_points(scan.vertices if isinstance(scan, Mesh) else scan, "scan")
         middle = (points.min(axis=0) + points.max(axis=0)) / 2 if len(points) else np.zeros(3)
-        # within 100 m nothing changes: at 3 m a registration is the same to 1e-14 m, at 5,000 km it was 15 mm off
+        # within 100 m nothing is moved: 3 m away a registration is the same to 1e-14 m; 5,000 km away it was 15 mm off
         if np.abs(middle).max() <= 100:
             return method(template, scan, *args, **named)
         near = {name: translate(value, -middle) for name, value in named.items()}
@@ -125,42 +151,55 @@ def near_origin(method: F) -> F:
 def register(template: Mesh, scan: Mesh | np.ndarray, landmarks: tuple[np.ndarray, np.ndarray] | None = None,
              config: RegistrationConfig | None = None, progress: Callable[[int, int], None] | None = None,
              correspondences: Correspondences | None = None, start: np.ndarray | None = None) -> Registration:
-    """Bring a template onto a scan.
+    """Register a template to a scan: deform it until its surface lies on the scan.
 
     Parameters
     ----------
     template : Mesh
         One connected manifold component.
     scan : Mesh or (n, 3) float, metres
-        May have holes, borders, several overlapping sheets, noise.
-    landmarks : (L,) int and (L, 3) float, metres, optional
-        Vertices of the template and where they are on the scan. Needed wherever the pose differs much.
+        It may have holes, borders, several overlapping sheets and noise.
+    landmarks : ((L,) int, (L, 3) float, metres), optional
+        Vertices of the template and their positions on the scan. Needed wherever the pose differs much.
+    config : RegistrationConfig, optional
+        Settings.
     progress : callable, optional
         Called as progress(done, total).
     correspondences : Correspondences, optional
-        Hints, some of which may be wrong: they draw softly, and less the farther they are from all others.
-    start : (4, 4) or (N, 3) float, optional
-        The similarity that brings the template near the scan, where it is known: else landmarks tell, or the whole is
-        aligned, which a scan of a part leads astray. Or where its vertices are nearly, metres, as a model finds them:
-        then only the last stages are needed, which match by place.
+        Hints, of which some may be wrong. Their pull is soft, and weaker for hints far from their target.
+    start : (4, 4) or (N, 3) float, metres, optional
+        A transform that brings the template near the scan; by default found from landmarks, else by ICP. ICP can fail
+        on a partial scan. Or approximate vertices, for example of a body model; then only the last stages run.
 
     Returns
     -------
     Registration
+        The mesh on the scan, metres, with the confidence of every vertex and quality figures.
 
     Raises
     ------
     ValueError
         A template that is not one manifold component, an empty scan, values that are not finite, fewer than
-        three landmarks or landmarks that do not exist, a method that is not known.
+        three landmarks or landmarks that do not exist, an unknown method.
+
+    Examples
+    --------
+    >>> t, p = np.meshgrid(np.linspace(0, np.pi, 12)[1:-1], np.arange(24) * np.pi / 12, indexing="ij")
+    >>> scan = np.stack([np.sin(t) * np.cos(p), np.sin(t) * np.sin(p), 1.2 * np.cos(t)], axis=-1).reshape(-1, 3)
+    >>> template = Mesh([[1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, 1], [0, 0, -1]], [
+    ...     [0, 2, 4], [2, 1, 4], [1, 3, 4], [3, 0, 4], [2, 0, 5], [1, 2, 5], [3, 1, 5], [0, 3, 5]])
+    >>> register(template, scan, config=RegistrationConfig.quick()).mesh.vertices.shape
+    (6, 3)
+
+    [Hahnel], [Allen], [Amberg]
     """
     config, tell = config or RegistrationConfig(), progress or (lambda done, total: None)
     if config.method not in METHODS:
         raise ValueError(f"method: expected one of {', '.join(METHODS)}, got {config.method!r}")
-    # what is known of both, and how every point is told from others: by place, normal, and paths to landmarks
+    # check the inputs; describe every point by position, normal and path lengths to landmarks
     inputs = prepare_problem(template, scan, landmarks, correspondences)
     begin = initial_transform(inputs) if start is None else _check_start(template, start)
-    # near the scan, from stiff to soft; then onto it, below its noise
+    # bring the template near the scan, from stiff to soft; then fit the surface down to the noise
     fit = METHODS[config.method](inputs, begin, config, lambda done, total: tell(90 * done // total, 100))
     fit = snap_to_surface(inputs, fit, config)
     tell(100, 100)
@@ -168,16 +207,16 @@ def register(template: Mesh, scan: Mesh | np.ndarray, landmarks: tuple[np.ndarra
 
 
 def _check_start(template: Mesh, start: np.ndarray) -> np.ndarray:
-    """A transform (4, 4) or vertices (N, 3) to begin with; ValueError for anything else."""
-    found = np.asarray(start, dtype=np.float64)
-    if found.shape not in ((4, 4), template.vertices.shape) or not np.isfinite(found).all():
+    """Check an initial transform (4, 4) or vertices (N, 3); ValueError for anything else."""
+    array = np.asarray(start, dtype=np.float64)
+    if array.shape not in ((4, 4), template.vertices.shape) or not np.isfinite(array).all():
         raise ValueError(f"start: expected a finite transform (4, 4) or vertices {template.vertices.shape}, "
-                         f"got {found.shape}")
-    return found
+                         f"got {array.shape}")
+    return array
 
 
 def snap_to_surface(inputs: RegistrationProblem, fit: Fit, config: RegistrationConfig) -> Fit:
-    """The surface at last: laid on the scan below its noise, without inverted triangles."""
+    """Fit the surface to the scan down to its noise, and repair inverted triangles."""
     if config.final_fit is not None:
         final = final_fit(inputs.template, fit.x, inputs.target, inputs.landmarks, config.final_fit)
         fit = Fit(final.vertices, {**fit.energies, "strain": final.strain}, fit.iterations + final.iterations,
@@ -186,19 +225,21 @@ def snap_to_surface(inputs: RegistrationProblem, fit: Fit, config: RegistrationC
 
 
 def registration_problem(template: Mesh, scan: Mesh | np.ndarray, fit: Registration, marked: bool) -> str | None:
-    """Why a registration means nothing, with the likely cause; None where it means something.
+    """Explain why a registration is meaningless, with the likely cause; None where it is not.
 
-    `marked` is whether landmarks led it.
+    `marked` says whether landmarks were used.
     """
     points = scan.vertices if isinstance(scan, Mesh) else scan
     far, seen, stretch = fit.uncovered, float(fit.seen.mean()), share_stretched(template, fit.mesh)
     off = fit.landmark_rms > HAND * size(template)
-    # with left and right exchanged 0.13 are not covered and 0.10 stretched. A part alone, with which the rest of the
-    # template is only invented: shins and feet give 0.15 of it data, one half 0.49, one view 0.26 to 0.46. The more of
-    # the template has data, the more of a scan may be furniture or a second person, to be looked at: of two people
-    # 0.42 are not covered and 0.87 have data, of a cylinder 0.32 and 0.28.
+    # Both uncovered and stretched above 0.05: with left and right exchanged they are 0.13 and 0.10.
+    # Less than 0.2 with data: most of the template is extrapolated. Shins and feet give 0.15, one view 0.26 to 0.46,
+    # half a body 0.49.
+    # Uncovered above 0.7 of the share with data: a well covered template may stand beside furniture or a second person.
+    # Two people have 0.42 uncovered and 0.87 with data, a cylinder 0.32 and 0.28.
     if not (far > min(0.5, 0.7 * seen) or seen < 0.2 or min(far, stretch) > 0.05 or off):
         return None
+    # the likeliest cause: wrong units, a partial scan, wrong landmarks, or something else
     cause = unit_problem(extent(points), extent(template.vertices), "the scan is", 0.05) or (
         "a part of the body only, which scape complete makes whole?" if far < 0.05 and not off else
         "landmarks of left and right exchanged, or of other places?" if marked and seen >= 0.01 else
@@ -210,29 +251,30 @@ def registration_problem(template: Mesh, scan: Mesh | np.ndarray, fit: Registrat
 
 
 def measure_fit(inputs: RegistrationProblem, fit: Fit, scan: Mesh | np.ndarray) -> Registration:
-    """What was found, measured against the whole scan."""
+    """Measure a fit against the whole scan, and return it with its quality figures."""
     body, size = inputs.template.with_vertices(fit.x), inputs.size
-    found = evidence(body, inputs.target, 0.015 * size, NORMALS * size)
-    seen = found.confidence >= 0.5
+    # data within 1.5% of the size count, 2 cm on a man
+    data = evidence(body, inputs.target, 0.015 * size, NORMALS * size)
+    seen = data.confidence >= 0.5
     landmark_rms = np.nan
     if inputs.landmarks is not None:
         apart = np.linalg.norm(fit.x[inputs.landmarks[0]] - inputs.landmarks[1], axis=1)
         landmark_rms = float(np.sqrt(np.mean(apart**2)))
     return Registration(
-        mesh=body, distances=np.where(seen, found.distances, np.nan), seen=seen,
-        rms=float(np.sqrt(np.mean(found.distances[seen] ** 2))) if seen.any() else np.nan, landmark_rms=landmark_rms,
+        mesh=body, distances=np.where(seen, data.distances, np.nan), seen=seen,
+        rms=float(np.sqrt(np.mean(data.distances[seen] ** 2))) if seen.any() else np.nan, landmark_rms=landmark_rms,
         converged=bool(fit.moved <= 0.001 * size and seen.any()), iterations=fit.iterations, energies=fit.energies,
-        inverted=int(find_inverted_triangles(inputs.template, fit.x).sum()), confidence=found.confidence,
+        inverted=int(find_inverted_triangles(inputs.template, fit.x).sum()), confidence=data.confidence,
         uncovered=share_uncovered(scan, body, 0.01 * size))
 
 
 @dataclass(frozen=True, eq=False)
 class Evidence:
-    """What the scan says of every vertex of a template that lies on it.
+    """How well the scan supports every vertex of a registered template.
 
-    The confidence (N,) goes from 0, no data here, to 1: a scanned surface lies here, faces the same way, does not end
-    here, and its points find this part of the template too. Distances (N,), metres, are to the plane of the scan at the
-    nearest point that faces the same way; NaN where that is too far.
+    The confidence (N,) goes from 0, no data here, to 1: a scanned surface lies here, faces the same way and does not
+    end here, and its points match this part of the template too. Distances (N,), metres, are to the tangent plane at
+    the nearest point that faces the same way; NaN where that is too far.
     """
 
     confidence: np.ndarray
@@ -240,30 +282,32 @@ class Evidence:
 
 
 def evidence(deformed: Mesh, target: Target, reach: float, scale: float) -> Evidence:
-    """The data near every vertex of the template on the scan, weighed; farther away than `reach` (metres) are none.
+    """Weigh the data near every vertex of a registered template; points beyond `reach` (metres) count for nothing.
 
-    A difference of normals of one counts like a distance of `scale` metres.
+    A unit difference of normals counts like a distance of `scale` metres.
     """
     def ramp(value: np.ndarray, low: float, high: float) -> np.ndarray:
         return np.clip((value - low) / (high - low), 0, 1)
 
     target = orient_by_mesh(target, deformed, scale)
     x, normals = deformed.vertices, deformed.vertex_normals
-    found = OrientedPoints(target.points, target.normals, scale).match(x, normals, reach)
+    forth = OrientedPoints(target.points, target.normals, scale).match(x, normals, reach)
     back = OrientedPoints(x, normals, scale).match(target.points, target.normals, reach)
-    v = np.flatnonzero(found.valid)
-    p = found.index[v]
+    v = np.flatnonzero(forth.valid)
+    p = forth.index[v]
+    # near the surface: full weight within twice the noise, a robust standard deviation from the median
     off = np.abs(np.einsum("nd,nd->n", target.normals[p], x[v] - target.points[p]))
     noise = 1.4826 * float(np.median(off)) if len(v) else 0.0
     near = np.exp(-0.5 * (np.maximum(off - 2 * noise, 0) / max(2 * noise, 0.05 * reach)) ** 2)
+    # facing the same way: none from 60 degrees on, full within 37
     facing = ramp(np.einsum("nd,nd->n", target.normals[p], normals[v]), 0.5, 0.8)
-    # the scan's points chose this vertex, or its neighbours, as theirs
+    # matched from the scan too: this vertex, or at least 0.1 to 0.4 of its neighbours, is the match of some point
     hits = (np.bincount(back.index[back.valid], minlength=len(x)) > 0).astype(float)
     A = deformed.vertex_adjacency
     degree = np.maximum(np.asarray(A.sum(axis=1)).ravel(), 1)
     chosen = ramp(np.maximum(hits, (A @ hits) / degree), 0.1, 0.4)
-    # Points that face the same way lie close by, and not at the edge of a hole. Close by is what the points around
-    # are to each other, but no less than usual: where views overlap they are dense.
+    # inside the scan: points that face the same way are as near as points are to each other, and few of them are on the
+    # border of a hole; never less than the median spacing, as overlapping views are dense
     tree = cKDTree(target.points)
     apart, around = tree.query(x, min(8, len(target.points)))
     nearest = tree.query(target.points, 2)[0][:, 1]
@@ -278,17 +322,17 @@ def evidence(deformed: Mesh, target: Target, reach: float, scale: float) -> Evid
 
 
 def share_uncovered(scan: Mesh | np.ndarray, registered: Mesh, far: float, samples: int = 5000) -> float:
-    """Share of the points of a scan that lie further than `far` (metres) from a mesh."""
+    """Compute the share of the points of a scan that lie further than `far` (metres) from a mesh."""
     points = scan.vertices if isinstance(scan, Mesh) else scan
     points = points[:: max(1, len(points) // samples)]
     return float((Surface(registered).closest(points).distances > far).mean())
 
 
 def share_stretched(template: Mesh, registered: Mesh, factor: float = 2.0) -> float:
-    """Share of the template's area that is longer by `factor`, or shorter, in some direction than most of the body is.
+    """Compute the share of the area stretched or shrunk by `factor` in some direction, against the median stretch.
 
-    Somebody smaller or slimmer than the template is nowhere stretched: one right registration had 0.058 that were half
-    as long as on the template, 0.007 that were half as long as usual in it.
+    So a smaller or slimmer person is nowhere stretched: one correct registration had 0.058 half as long as on the
+    template, but only 0.007 half as long as its median.
     """
     long, short = principal_stretches(template, registered)
     usual = float(np.median(np.concatenate([long, short])))
@@ -297,7 +341,7 @@ def share_stretched(template: Mesh, registered: Mesh, factor: float = 2.0) -> fl
 
 
 def principal_stretches(template: Mesh, registered: Mesh) -> tuple[np.ndarray, np.ndarray]:
-    """The largest and the smallest stretch (F,) of every triangle."""
+    """Compute the largest and the smallest stretch (F,) of every triangle: singular values of its deformation."""
     rest, now = (m.corners[:, 1:] - m.corners[:, :1] for m in (template, registered))
     # edges of the template in an orthonormal basis of its triangle, as a lower triangular matrix
     gram = np.einsum("fid,fjd->fij", rest, rest)

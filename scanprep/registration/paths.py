@@ -1,4 +1,4 @@
-"""Lengths of paths over a scan with holes or a template: what tells where a point lies, the same in every pose."""
+"""Path lengths over a template or a scan with holes: they identify a point on the body in every pose."""
 from __future__ import annotations
 
 import numpy as np
@@ -10,23 +10,25 @@ from ..geometry.farthest_points import thin
 
 
 def descriptors(lengths: np.ndarray, size: float) -> np.ndarray:
-    """Lengths (n, L) to compare: near landmarks tell more precisely than far ones, so logarithms.
+    """Turn path lengths (n, L) into descriptors: logarithms, because near landmarks locate a point more precisely.
 
-    Divided by the root of their number: the distance of two descriptors is the root mean square over landmarks.
+    They are divided by the root of L, so that their Euclidean distance is an RMS over landmarks. The 0.1 keeps lengths
+    below a tenth of the size from dominating.
     """
     return np.log(lengths / size + 0.1) / np.sqrt(lengths.shape[1])
 
 
 def path_lengths(points: np.ndarray, normals: np.ndarray, sources: np.ndarray, cell: float, oriented: bool = True
                  ) -> np.ndarray:
-    """Lengths (n, L), metres, of the shortest paths from sources (L, 3) to all points of a surface, holes bridged.
+    """Compute the lengths (n, L), metres, of the shortest paths from sources (L, 3) to all points, across holes too.
 
-    The points are thinned to `cell` metres. Where the normals point outward, `oriented`, paths do not jump between
-    skins that touch. Small pieces far from everything take the way to the nearest point of the rest as the crow flies.
+    The points are thinned to `cell` metres. With outward normals (`oriented`) paths do not jump between skins that
+    touch. Small remote pieces are reached in a straight line from the nearest point of the rest.
     """
     keep = thin(points, cell)
     p, n = points[keep], normals[keep]
-    # links between the ten nearest whose normals agree; the points may lie wider than the cells
+    # link the ten nearest neighbours whose normals agree, at most three spacings apart: points may be sparser than
+    # cells
     length, near = cKDTree(p).query(p, min(11, len(p)))
     i, j = np.repeat(np.arange(len(p)), near.shape[1]), near.ravel()
     good = (length.ravel() <= 3 * max(cell, float(np.median(length[:, 1])))) & (j != i)
@@ -34,7 +36,7 @@ def path_lengths(points: np.ndarray, normals: np.ndarray, sources: np.ndarray, c
     agree = np.einsum("nd,nd->n", n[i], n[j])
     good = (agree if oriented else np.abs(agree)) > 0
     graph = csr_array(coo_array((length[good], (i[good], j[good])), shape=(len(p), len(p))))
-    # pieces of more than three thousandths are joined, the largest first, to what there is, where they are nearest
+    # bridge holes: join pieces with more than 0.3% of the points to the rest where they are nearest, largest first
     count, label = connected_components(graph, directed=False)
     size = np.bincount(label, minlength=count)
     joined = label == size.argmax()
@@ -44,12 +46,14 @@ def path_lengths(points: np.ndarray, normals: np.ndarray, sources: np.ndarray, c
             continue
         piece, inside = np.flatnonzero(label == k), np.flatnonzero(joined)
         length, to = cKDTree(p[inside]).query(p[piece])
+        # over the nearest fiftieth of their points, so that a path may cross anywhere along the gap
         best = np.argsort(length)[:max(len(piece) // 50, 3)]
         bridges.append(np.stack([length[best], piece[best], inside[to[best]]]))
         joined[piece] = True
     if bridges:
         length, i, j = np.concatenate(bridges, axis=1)
         graph = csr_array(graph + coo_array((length, (i.astype(int), j.astype(int))), shape=graph.shape))
+    # shortest paths over the joined points; every input point adds the way to its nearest one
     rest = np.flatnonzero(joined)
     tree = cKDTree(p[rest])
     apart, at = tree.query(sources)

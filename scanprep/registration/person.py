@@ -1,7 +1,7 @@
-"""The parts of a template that is a person: the average of the synthetic people, brought onto it.
+"""Find the body parts of a template that is a person, by registering the average synthetic person to it.
 
-No scan and no pose but the template's own is needed, so a body has named parts, and angles of its joints that can be
-compared with those of people, before its first scan is registered.
+This needs no scan and no other pose. So a template has named parts and joint angles, which can be compared with those
+of people, before its first scan is registered.
 """
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ from .schedule import RegistrationConfig
 class PersonParts:
     """The parts of a template, those of the synthetic people.
 
-    The rotations R_template_rest (16, 3, 3) bring every part of the synthetic people from rest to the template.
+    Rotations R_template_rest (16, 3, 3) take every part of the synthetic people from its rest pose to the template.
     """
 
     skeleton: Skeleton
@@ -38,9 +38,9 @@ class PersonParts:
 
 
 def person_parts(template: Mesh, progress: Callable[[int, int], None] | None = None) -> PersonParts | None:
-    """The parts of a template; None where the average person does not come to lie on it: an animal, a hand, a half.
+    """Find the parts of a template; None where the average person does not fit it: an animal, a hand, half a body.
 
-    `progress` is called as progress(done, total). What was found is remembered as long as the template lives.
+    `progress` is called as progress(done, total). The result is cached as long as the template lives.
     """
     if template not in _known:
         _known[template] = _find_parts(template, progress or (lambda done, total: None))
@@ -51,9 +51,9 @@ _known: WeakKeyDictionary[Mesh, PersonParts | None] = WeakKeyDictionary()
 
 
 def stature(template: Mesh, parts: PersonParts, vertices: np.ndarray) -> float:
-    """How tall a person is in whatever pose, metres: as much more than the template as the bones are longer.
+    """Estimate the stature of a person in any pose, metres: the template's, scaled by the total length of the bones.
 
-    `vertices` (N, 3), metres, are the template's on the person.
+    `vertices` (N, 3), metres, are those of the registered template.
     """
     regressor, parents = parts.skeleton.joint_regressor(template), parts.skeleton.parents
 
@@ -66,15 +66,16 @@ def stature(template: Mesh, parts: PersonParts, vertices: np.ndarray) -> float:
 
 
 def _find_parts(template: Mesh, tell: Callable[[int, int], None]) -> PersonParts | None:
-    """The parts of a template that was not seen before."""
+    """Find the parts of a template that is not in the cache."""
     person = average_person()
     if np.array_equal(template.faces, person.mesh.faces):
-        # in the triangles of the synthetic people every vertex is known: nothing has to be registered
+        # the template has the triangles of the synthetic people: no registration is needed
         part_of_face, vertices = person.part_of_face, template.vertices
     else:
         fit = _person_on(template, None, RegistrationConfig(), tell)
         if fit is None:
             return None
+        # each triangle takes the part of the nearest triangle of the registered average person
         nearest = Surface(fit.mesh).closest(template.corners.mean(axis=1)).faces
         part_of_face, vertices = person.part_of_face[nearest], fit.mesh.vertices
     if len(np.unique(part_of_face)) < len(PARTS):
@@ -85,9 +86,8 @@ def _find_parts(template: Mesh, tell: Callable[[int, int], None]) -> PersonParts
 
 
 def has_limbs(template: Mesh) -> bool:
-    """Whether a template has the ends of five limbs, as head, hands and feet of a person."""
+    """Test whether a template has five limb ends, as the head, hands and feet of a person."""
     try:
-        # head, hands and feet
         return len(find_seeds(average_person().mesh, template)) >= 5
     except ValueError:             # it has too few ends of limbs
         return False
@@ -95,9 +95,9 @@ def has_limbs(template: Mesh) -> bool:
 
 def _person_on(template: Mesh, landmarks: tuple[np.ndarray, np.ndarray] | None, config: RegistrationConfig,
                tell: Callable[[int, int], None]) -> Registration | None:
-    """The average person on a template, led by landmarks or by the ends of limbs; None where it does not lie on it."""
+    """Register the average person to a template, by landmarks or by limb ends; None where it does not fit."""
     person = average_person().mesh
-    matching = 30  # per cent of the time, before the person is registered
+    matching = 30  # per cent of the progress bar; registration takes the rest
     if landmarks is not None:
         fit = register(person, template, landmarks, config, tell)
     else:
@@ -108,17 +108,17 @@ def _person_on(template: Mesh, landmarks: tuple[np.ndarray, np.ndarray] | None, 
                                      progress=lambda done, total: tell(round(matching * done / total), 100))
         fit = register(person, template, None, config, correspondences=pairs, progress=lambda done, total: tell(
             round(matching + (100 - matching) * done / total), 100))
-    # shares of a template and of the person on it beyond which it is no person
+    # no person: more than 2% of the template uncovered, or more than 5% of the average person stretched to the double
     return None if fit.uncovered > 0.02 or share_stretched(person, fit.mesh) > 0.05 else fit
 
 
 def find_landmarks(template: Mesh, known: Mapping[str, int],
                    progress: Callable[[int, int], None] | None = None) -> dict[str, int]:
-    """All landmarks of the synthetic people on a template of which some are known, or none.
+    """Find all landmarks of the synthetic people on a template of which some are known, or none.
 
-    The average person is brought onto the template, led by the known ones where these are at least four, and every
-    other landmark goes along to the nearest vertex. Somebody who clicks would be a few centimetres off in the middle
-    of the trunk and the limbs, nearer at their ends.
+    The average person is registered to the template, by the known landmarks if there are at least four. Every other
+    landmark moves to the nearest vertex. They agree with clicks to a few centimetres in the middle of trunk and limbs,
+    better at their ends.
 
     Parameters
     ----------
@@ -132,21 +132,21 @@ def find_landmarks(template: Mesh, known: Mapping[str, int],
     Returns
     -------
     dict of name to int
-        Those that are known, as they are, by our names; then the others. The known ones alone where the average
-        person does not come to lie on the template.
+        The known landmarks unchanged, by our names, then the others. Only the known ones where the average person does
+        not fit the template.
     """
-    marks, given = landmarks(), translate_landmarks(known)
-    names, vertices, places = match_landmarks(marks, given, minimum=0)
-    # landmarks from which the average person finds the others
+    marks, known_marks = landmarks(), translate_landmarks(known)
+    names, vertices, places = match_landmarks(marks, known_marks, minimum=0)
+    # four known landmarks are enough to start from; with fewer, limb ends are used
     led = (vertices, template.vertices[places]) if len(names) >= 4 else None
     fit = _person_on(template, led, RegistrationConfig.quick(), progress or (lambda done, total: None))
     if fit is None:
-        return given
+        return known_marks
     nearest = cKDTree(template.vertices).query(fit.mesh.vertices[list(marks.values())])[1]
-    return given | {name: int(v) for name, v in zip(marks, nearest, strict=True) if name not in given}
+    return known_marks | {name: int(v) for name, v in zip(marks, nearest, strict=True) if name not in known_marks}
 
 
 @lru_cache(maxsize=1)
 def average_person() -> SyntheticPerson:
-    """The synthetic person that templates are compared with."""
+    """Return the average synthetic person, to which templates are compared."""
     return SyntheticPerson()

@@ -1,7 +1,7 @@
-"""A registration in which limbs came to lie as no person's do, with other rolls of these limbs.
+"""Repair registrations with anatomically impossible limbs, by trying other rolls of these limbs.
 
-Each is followed for a few rounds. The one that leaves the least to doubt then is followed to the end, and kept if it
-lies on the scan and stretches no more than what was there.
+Each candidate runs for a few rounds. The most plausible one then runs to the end. It is kept if it lies on the scan as
+well as before and stretches no more.
 """
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from .person import PersonParts
 from .rolls import other_rolls
 from .schedule import RegistrationConfig
 
-LESS_DOUBTED = 0.1                     # 1 is a doubt where it begins
+LESS_DOUBTED = 0.1                     # least gain in severity that counts; an issue at its limit has 1
 
 
 @near_origin
@@ -34,15 +34,16 @@ def repair_limbs(template: Mesh, scan: Mesh | np.ndarray, fit: Registration, par
                  landmarks: Landmarks | None = None, config: RegistrationConfig | None = None,
                  progress: Callable[[int, int], None] | None = None, correspondences: Correspondences | None = None
                  ) -> Registration:
-    """A registration with its doubted limbs rolled otherwise, where that is better; else as it is.
+    """Re-roll the implausible limbs of a registration where that is better; else return it as it is.
 
     Parameters
     ----------
     template, scan, landmarks, config, correspondences
         As the registration was made with.
     fit : Registration
+        The registration to repair.
     parts : PersonParts, optional
-        Of a template that is a person; where there are none, nothing is repaired.
+        Parts of a template that is a person; with None nothing is repaired.
     progress : callable, optional
         Called as progress(done, total).
 
@@ -58,36 +59,36 @@ def repair_limbs(template: Mesh, scan: Mesh | np.ndarray, fit: Registration, par
     doubted = list(dict.fromkeys(doubt.part for doubt in limb_doubts(template, parts, x)))
     if not doubted:
         return fit
-    # the last stages match by positions alone: no path to landmarks or hints is needed
+    # the last stages match by position alone, so no path descriptors are computed
     inputs = replace(prepare_problem(template, scan), landmarks=landmarks, hints=correspondences)
     coarse = [stage for stage in stages if stage.nodes == stages[0].nodes]
     graph, tell = build_graph(template, coarse[0].nodes), progress or (lambda done, total: None)
-    tries = other_rolls(parts, parts.skeleton.fit_rotations(template, x), doubted, config.rolls)
+    candidate_rolls = other_rolls(parts, parts.skeleton.fit_rotations(template, x), doubted, config.rolls)
     start, looks = motion_of(graph, x), list[tuple[float, float, GraphFit]]()
-    # what becomes of each in the coarse stages, cut short to three rounds: how much is to be doubted, and the share of
-    # the scan off it; with as little detail as the rolls are looked at with
+    # run each candidate through the coarse stages, three rounds each at most, and note severity and uncovered share
     short = [replace(stage, rounds=min(stage.rounds, 3), ends=0) for stage in coarse]
     now = severity(limb_doubts(template, parts, deform(graph, start)))
-    for number, angles in enumerate(tries):
+    for number, angles in enumerate(candidate_rolls):
         motion = roll_parts(graph, start, template, parts, x, angles)
         begun = GraphFit(deform(graph, motion), graph=graph, motion=motion, iterations=fit.iterations)
         trial = fit_stages(inputs, begun, short)
         looks.append((severity(limb_doubts(template, parts, trial.x)),
                       share_uncovered(scan, template.with_vertices(trial.x), 0.01 * inputs.size), trial))
-        tell(number + 1, len(tries) + 1)
+        tell(number + 1, len(candidate_rolls) + 1)
+    # run the most plausible candidate to the end, if it promises a gain; keep it only if it is better
     best = min(looks, key=lambda look: look[:2], default=None)
     if best is not None and best[0] + LESS_DOUBTED < now:
         end = snap_to_surface(inputs, fit_stages(inputs, best[2], stages[len(coarse) - 1:]), config)
-        found = measure_fit(inputs, end, scan)
-        if better(template, parts, found, fit):
-            fit = replace(found, rolled=True)
-    tell(len(tries) + 1, len(tries) + 1)
+        trial_fit = measure_fit(inputs, end, scan)
+        if better(template, parts, trial_fit, fit):
+            fit = replace(trial_fit, rolled=True)
+    tell(len(candidate_rolls) + 1, len(candidate_rolls) + 1)
     return fit
 
 
 def better(template: Mesh, parts: PersonParts, trial: Registration, fit: Registration) -> bool:
-    """Whether less is to be doubted in a registration than in another, on the scan as well and no more stretched."""
-    less_covered = 0.001  # share of the scan
+    """Test whether a trial is more plausible than a fit, covers the scan as well and is no more stretched."""
+    less_covered = 0.001  # loss that is tolerated: share of the scan, and landmark distance in sizes
     return (severity(limb_doubts(template, parts, trial.mesh.vertices)) + LESS_DOUBTED
             < severity(limb_doubts(template, parts, fit.mesh.vertices))
             and trial.uncovered <= fit.uncovered + less_covered
@@ -96,24 +97,25 @@ def better(template: Mesh, parts: PersonParts, trial: Registration, fit: Registr
 
 
 def severity(doubts: tuple[PlausibilityIssue, ...]) -> float:
-    """How much is to be doubted in all."""
+    """Return the total severity of all issues."""
     return sum(doubt.excess for doubt in doubts)
 
 
 def strain(template: Mesh, registered: Mesh) -> float:
-    """The root mean square over the area of the logarithm of stretches."""
+    """Compute the RMS logarithm of principal stretches, weighted by area."""
     logs = np.log(np.maximum(principal_stretches(template, registered), 1e-3))
     return float(np.sqrt(np.average((logs**2).mean(axis=0), weights=template.face_areas)))
 
 
 def roll_parts(graph: DeformationGraph, motion: NodeMotion, template: Mesh, parts: PersonParts, x: np.ndarray,
                angles: np.ndarray) -> NodeMotion:
-    """A motion of nodes with every part rolled about its own bone by an angle (16,), radians, the bone left in place.
+    """Roll every part of a graph motion about its own bone by an angle (16,), radians; the bones stay in place.
 
-    Vertices x (N, 3), metres, tell where the bones are.
+    Vertices x (N, 3), metres, are the current body, from which the bones are estimated.
     """
     skeleton = parts.skeleton
     R = skeleton.fit_rotations(template, x) @ parts.R_template_rest
+    # rotation of each part about its current bone, through the centroid of its vertices
     turns = rotations.exp(angles[:, None] * np.einsum("pij,pj->pi", R, frames()[:, 0]))
     part = skeleton.part_of_vertex(template)
     middles = np.stack([x[part == p].mean(axis=0) for p in range(len(angles))])
@@ -121,7 +123,7 @@ def roll_parts(graph: DeformationGraph, motion: NodeMotion, template: Mesh, part
     i, j = graph.edges.T
     links = csr_array(coo_array((np.ones(len(i)), (i, j)), shape=(len(weights), len(weights))))
     mean = diags_array(1 / np.asarray(links.sum(axis=1)).ravel()) @ links
-    weights = 0.5 * (weights + mean @ weights)                    # a roll sets in over one link at a joint
+    weights = 0.5 * (weights + mean @ weights)                    # blend the roll over one link at a joint
     turned = middles + np.einsum("pij,npj->npi", turns, motion.positions[:, None] - middles)
     return replace(motion, R=rotations.project(np.einsum("np,pij->nij", weights, turns)) @ motion.R,
                    positions=np.einsum("np,npi->ni", weights, turned))

@@ -16,9 +16,9 @@ class FinalFitRound(Settings):
     field : float
         Length over which rotations and stretches are smoothed.
     tension : float
-        Distance to the data that a gradient of one off the smooth field is worth.
+        Distance to the data that costs as much as a unit deviation from the smooth field.
     reach : float
-        Farthest match that counts.
+        Largest distance of a match.
     """
 
     field: Positive
@@ -32,21 +32,21 @@ class FinalFitConfig(Settings):
 
     Attributes
     ----------
-    rounds : of measuring, smoothing and laying out
+    rounds : rounds of measuring, smoothing and solving
     noise_width : float
         Neighbourhood over which the scan's noise is averaged.
     slide : float
-        Force of the data along the surface, as a share of that across it.
+        Pull of the data along the surface, as a share of that across it.
     stay : float
-        Force towards the start where there are no data, as a share of what the data would have.
+        Pull towards the start where there are no data, as a share of the pull of data.
     landmarks : float
-        The share of the surface that one landmark weighs as much as.
+        Weight of one landmark, as a share of the surface.
     """
 
-    # wide at first, so that folds and slides of the coarse registration vanish; then as fine as the noise allows
+    # wide first, so that folds and tangential errors of the coarse registration vanish; then as fine as noise allows
     rounds: tuple[FinalFitRound, ...] = (FinalFitRound(field=0.02, tension=0.007, reach=0.02),
                                          *3 * (FinalFitRound(field=0.015, tension=0.004, reach=0.015),))
-    noise_width: Positive = 0.007
+    noise_width: Positive = 0.007          # 1 cm on a man
     slide: float = 0.05
     stay: float = 0.003
     landmarks: float = 0.0002
@@ -61,26 +61,26 @@ class GraphStage(Settings):
     nodes : int
         Nodes of the graph.
     stretch, growth : float
-        Resistance of the nodes, as the distance to the data that a strain, or a growth by e between neighbours, is
-        worth; with a growth of 0 nodes keep their size. A rotation by a radian is worth a tenth of a strain.
+        Stiffness of the nodes: the distance to the data that costs as much as a strain of one, or as a growth by e
+        between neighbours. With a growth of 0 nodes keep their size. A rotation by a radian costs a tenth of a strain.
     landmarks : float
-        The share of the surface that one landmark weighs as much as.
+        Weight of one landmark, as a share of the surface.
     reach : float
-        Farthest match that counts; 0 leaves the scan out.
+        Largest distance of a match; 0 ignores the scan.
     slide : float
-        Force of a match along the surface, as a share of that across it.
+        Pull of a match along the surface, as a share of that across it.
     rounds : int
-        Times that matches are sought anew.
+        How often matches are found anew.
     detail : float
         Spacing to which scan and template are thinned for matching.
     positions : float
-        How much positions count when matches are sought; 0 seeks by paths alone.
+        Weight of positions in matching; 0 matches by path lengths alone.
     paths : float
-        Distance that a difference by e between path lengths to the landmarks is worth when matching.
+        Distance that equals a factor of e between path lengths to the landmarks in matching.
     hints : float
-        The share of the surface that all given correspondences together weigh as much as.
+        Weight of all given correspondences together, as a share of the surface.
     ends : int
-        How many ends of the body are tried afterwards in other rotations about themselves.
+        How many ends of the body (head, hands, feet) are tried in other rotations afterwards.
     """
 
     nodes: Count
@@ -98,14 +98,14 @@ class GraphStage(Settings):
 
     @property
     def bend(self) -> float:
-        """What a rotation by a radian between neighbours is worth; as a decimal number, so that 0.7 gives 0.07."""
+        """Stiffness against a rotation of one radian between neighbours; rounded, so that 0.7 gives 0.07."""
         return round(0.1 * self.stretch, 9)
 
 
 def stages(table: str) -> tuple[GraphStage, ...]:
-    """The stages of a table: a line with the names of the columns, then one for each stage, its reason behind a bar.
+    """Read stages from a table: a line of column names, then one line per stage with its reason after a bar.
 
-    A dash stands for what is usual.
+    A dash stands for the default.
 
     Examples
     --------
@@ -118,19 +118,19 @@ def stages(table: str) -> tuple[GraphStage, ...]:
                                for name, value in zip(names, row, strict=True) if value != "-"}) for row in rows)
 
 
-# By paths alone first, which need no start; then stiffness and reach fall together, as matches become right.
+# Path lengths alone first, which need no initial alignment; then stiffness and reach fall as matches become right.
 USUAL = stages("""
 nodes stretch growth landmarks reach slide rounds detail positions paths hints ends | why
-150   0.7     2.0    0.1       1.0   1.0   4      -      0.0       0.3   1.0   -    | limbs bend to where paths say
-150   0.5     2.0    0.1       0.3   0.3   5      -      0.3       0.3   1.0   -    | places begin to tell skins apart
-150   0.3     0.7    0.05      0.2   0.1   4      -      -         0.2   0.5   -    | growth evens out, as in a person
-150   0.2     0.7    0.01      0.15  0.05  5      -      -         0.1   0.2   -    | landmarks are clicks, with errors
+150   0.7     2.0    0.1       1.0   1.0   4      -      0.0       0.3   1.0   -    | limbs bend to where paths match
+150   0.5     2.0    0.1       0.3   0.3   5      -      0.3       0.3   1.0   -    | positions tell skins apart
+150   0.3     0.7    0.05      0.2   0.1   4      -      -         0.2   0.5   -    | neighbours grow alike
+150   0.2     0.7    0.01      0.15  0.05  5      -      -         0.1   0.2   -    | clicked landmarks have errors
 150   0.13    0.7    0.01      0.11  0.0   4      -      -         0.05  0.1   -    | hints fade: some are wrong
 300   0.09    0.7    0.01      0.08  0.0   4      -      -         -     -     -    | forearms and shins follow
 300   0.06    0.7    0.01      0.06  0.0   4      -      -         -     -     -    | hands and feet follow
-300   0.02    0.7    0.01      0.05  0.0   5      0.014  -         -     -     5    | ends lie near: rolled otherwise?
+300   0.02    0.7    0.01      0.05  0.0   5      0.014  -         -     -     5    | try other rotations of ends
 1000  0.02    0.35   0.01      0.037 -     -      0.008  -         -     -     -    | fingers, muscles
-1000  0.015   0.35   0.005     0.028 -     -      0.008  -         -     -     -    | the surface decides, not clicks
+1000  0.015   0.35   0.005     0.028 -     -      0.008  -         -     -     -    | surface outweighs clicks
 """)
 
 
@@ -141,12 +141,17 @@ class RegistrationConfig(Settings):
     Attributes
     ----------
     method : str
-        How the template is brought near the scan, before the last pass: a name in `METHODS`.
+        Method of the coarse registration, before the final fit: a name in `METHODS`.
     graph : stages of the deformation graph
     rolls : int
-        How many other rolls of the limbs are tried where limbs lie as no person's do; 0 leaves that out.
+        How many other rolls are tried where limbs are anatomically impossible; 0 tries none.
     final_fit : FinalFitConfig or None
-        The last pass: the surface follows the scan below its noise.
+        The last pass: the surface follows the scan to its noise. None leaves it out.
+
+    Examples
+    --------
+    >>> RegistrationConfig.quick().final_fit is None
+    True
     """
 
     graph: tuple[GraphStage, ...] = USUAL
@@ -156,12 +161,12 @@ class RegistrationConfig(Settings):
 
     @property
     def near_stages(self) -> list[GraphStage]:
-        """The stages that match by place alone, and need the template near the scan."""
+        """The stages that match by position alone; they need the template near the scan."""
         return [stage for stage in self.graph if stage.positions == 1 and not stage.paths and stage.reach]
 
     @classmethod
     def quick(cls) -> RegistrationConfig:
-        """Without the last steps: a third of the time, 7 mm from true landmarks instead of 6."""
+        """Return settings without the last steps: a third of the time, 7 mm from true landmarks instead of 6."""
         whole = cls()
         return replace(whole, graph=whole.graph[:-1], final_fit=None)
 
@@ -169,11 +174,11 @@ class RegistrationConfig(Settings):
     def from_paper(cls) -> RegistrationConfig:
         """The registration that [SCAPE] used: rigid links between neighbours, matches point to point [Hahnel].
 
-        Nodes keep their size; the template is drawn to the landmarks first, then to the scan with ever softer links.
-        Not as in the paper: how soft they are and when, which it does not tell; triangles that end inverted are mended,
-        and commands press soles to a scan that ends flat around the feet.
+        Nodes keep their size. The template is pulled to the landmarks first, then to the scan with ever softer links.
+        Not from the paper, as it gives no values: how soft links are, and when. Not in the paper: inverted triangles
+        are repaired, and commands press soles to a scan that ends flat around the feet.
         """
-        # landmarks first, ever heavier; then the scan, over ever softer links; each sought anew a few times
+        # first landmarks with growing weight, then the scan with softening links; matches are found anew in each round
         return cls(stages("""
             nodes stretch growth landmarks reach slide rounds detail | why
             500   0.7     0      0.001     0     1     24     0.0001 | the whole body turns

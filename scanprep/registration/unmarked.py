@@ -1,7 +1,7 @@
-"""Registration without landmarks, or with few: through a model that finds a body on the scan; by correspondences.
+"""Registration without landmarks, or with few: initialised by a body model, else by automatic correspondences.
 
-The second is tried where the first leaves much to doubt, and the one that leaves less is kept. Bodies lie on a scan
-nearly as well turned round or mirrored: where a second one leaves hardly more to doubt, it is told too.
+Correspondences are tried where the model leaves much doubt, and the better result is kept. A body turned round or
+mirrored may fit a scan nearly as well. Such a rival is reported.
 """
 from __future__ import annotations
 
@@ -26,18 +26,18 @@ from .person import PersonParts
 from .repair import repair_limbs, severity
 from .schedule import RegistrationConfig
 
-FEW = 7                              # landmarks from which on they lead a template alone
-CLEARLY = 0.8                        # of the doubts that the first leaves, below which another registration is better
-# Doubts that the model's bodies leave, from which on correspondences are tried too. Below, on six poses and two men,
-# they led to the same within a millimetre, or 3 mm farther off, and took a minute.
+FEW = 7                              # landmarks from which on no model is needed
+CLEARLY = 0.8                        # another registration is better if it has less than this share of the doubt
+# Doubt from which on correspondences are tried besides the model. Below it, on six poses and two men, they gave the
+# same result within a millimetre, or one 3 mm worse, and took a minute.
 GRAVE = 3.0
-UNCOVERED = 0.005                    # share of the scan off the template, from which on a limb may be lost
+UNCOVERED = 0.005                    # share of the scan off the template from which on a limb may be missed
 RIVAL = "another body explains the scan as well"
 
 
 @dataclass(frozen=True, eq=False)
 class Candidate:
-    """A registration, how much speaks against it (`weigh_doubts`), and what led it, in words."""
+    """A registration, how much speaks against it (`weigh_doubts`), and what initialised it, in words."""
 
     doubt: float
     fit: Registration
@@ -54,19 +54,50 @@ def register_by_any(template: Mesh, scan: Mesh | np.ndarray, landmarks: Landmark
                     config: RegistrationConfig | None = None, search: CorrelatedConfig | None = None,
                     progress: Callable[[int, int], None] | None = None, model: Path | None = None
                     ) -> LedRegistration:
-    """Bring a template onto a scan by what there is, limbs repaired: landmarks; few of them, or none, and a lead;
-    correspondences, where all bodies that a lead finds leave much to doubt.
+    """Register a template by whatever is known: landmarks, a model (`lead`), or automatic correspondences.
 
-    The likeliest body is kept unless another one, or correspondences, leave clearly less to doubt. Another body that
-    leaves hardly more is the rival of the one that is kept. `model` is passed on to the lead. ValueError as from
-    `register_unmarked` where that is all there is.
+    Enough landmarks are used alone. Else the model proposes bodies. If all of them are doubtful, correspondences are
+    tried too. The likeliest body is kept unless another result is clearly less doubtful. A different body that is
+    almost as good is returned as `rival`. Implausible limbs are repaired.
+
+    Parameters
+    ----------
+    template : Mesh
+        One connected manifold component.
+    scan : Mesh or (n, 3) float, metres
+        The scan.
+    landmarks : ((L,) int, (L, 3) float, metres), optional
+        Vertices of the template and their positions on the scan.
+    lead : Lead, optional
+        Finds bodies on the scan.
+    parts : PersonParts, optional
+        Parts of a template that is a person.
+    config : RegistrationConfig, optional
+        Settings of the registration.
+    search : CorrelatedConfig, optional
+        Settings of the correspondences.
+    progress : callable, optional
+        Called as progress(done, total).
+    model : Path, optional
+        Model file, passed on to the lead.
+
+    Returns
+    -------
+    LedRegistration
+
+    Raises
+    ------
+    ValueError
+        As from `register_unmarked`, if nothing else is possible.
     """
     clicked = [] if landmarks is None else [number_of(len(landmarks[0]), "landmark")]
+    # enough landmarks, or no model: landmarks alone
     if landmarks is not None and (lead is None or len(landmarks[0]) >= FEW):
         fit = register(template, scan, landmarks, config, progress)
         if not registration_problem(template, scan, fit, marked=True):
             fit = repair_limbs(template, scan, fit, parts, landmarks, config)
         return LedRegistration(fit, clicked[0])
+    # the bodies that the model proposes, until one leaves no doubt
     candidates = list[Candidate]()
     if lead is not None:
         way = ", ".join([*clicked, f"model {lead.name}"])
@@ -74,13 +105,14 @@ def register_by_any(template: Mesh, scan: Mesh | np.ndarray, landmarks: Landmark
             fit = register(template, scan, landmarks, config, progress, start=vertices)
             candidates.append(Candidate(weigh_doubts(template, parts, fit), fit, way))
             if not candidates[-1].doubt:
-                return candidates[-1].led                      # nothing to doubt: no other body is sought
-        # the best body and its rival, both repaired, stand for what they were
+                return candidates[-1].led  # no doubt: try no other body
+        # repair the limbs of the best body and of its rival
         first = choose_clearly(candidates)
         chosen = [one for one in (first, find_rival(template, first, candidates)) if one is not None]
         others = [one for one in candidates if one not in chosen]
         mended = [repair_limbs(template, scan, one.fit, parts, landmarks, config) for one in chosen]
         candidates = [*(Candidate(weigh_doubts(template, parts, fit), fit, way) for fit in mended), *others]
+    # all doubtful, or no model: try correspondences; their failure counts only if there is nothing else
     if landmarks is None and all(one.doubt > GRAVE for one in candidates):
         try:
             fit, pairs = register_unmarked(template, scan, config, search, progress)
@@ -99,21 +131,21 @@ def register_by_any(template: Mesh, scan: Mesh | np.ndarray, landmarks: Landmark
 
 
 def choose_clearly(candidates: Sequence[Candidate]) -> Candidate:
-    """The first of some registrations, or the one of least doubt where that leaves clearly less."""
+    """Choose the first candidate, or the least doubtful one where that is clearly better."""
     best = min(candidates, key=attrgetter("doubt"))
     return best if best.doubt < CLEARLY * candidates[0].doubt else candidates[0]
 
 
 def find_rival(template: Mesh, best: Candidate, candidates: Sequence[Candidate]) -> Candidate | None:
-    """Of other bodies than the best the one of least doubt, where that is not clearly more; else None.
+    """Find the least doubtful different body, if it is not clearly worse than the best; else None.
 
-    Another body is one whose worst tenth is more than a hand's width off: a twisted limb makes none, and neither does
-    a limb of which the scan shows nothing in either.
+    A body is different if its worst tenth is more than a hand's width away. A twisted limb is not enough, nor is a limb
+    without data in both.
     """
     def apart(fit: Registration) -> float:
         shown = fit.seen | best.fit.seen
         far = np.sort(np.linalg.norm(fit.mesh.vertices - best.fit.mesh.vertices, axis=1)[shown])
-        # share of the vertices that tells two bodies apart: about that of an arm
+        # the worst tenth of the vertices: about as many as an arm has
         return float(far[-max(1, int(0.1 * len(far))):].mean()) if len(far) else 0.0
 
     others = [one for one in candidates if CLEARLY * one.doubt <= best.doubt and apart(one.fit) > HAND * size(template)]
@@ -121,12 +153,12 @@ def find_rival(template: Mesh, best: Candidate, candidates: Sequence[Candidate])
 
 
 def weigh_doubts(template: Mesh, parts: PersonParts | None, fit: Registration) -> float:
-    """How much speaks against a registration: limbs, sides that are exchanged, and what of a scan is not covered.
+    """Sum what speaks against a registration: limbs, exchanged sides, and the uncovered share of the scan.
 
-    Each counts 1 where it begins to be doubted; 0 where nothing does.
+    Each counts 1 at its limit; 0 means no doubt.
     """
     lost = fit.uncovered / UNCOVERED
-    # doubts that exchanged sides count as: more than any limb
+    # exchanged sides count 10, more than any limb
     limbs = 0.0 if parts is None else severity(limb_doubts(template, parts, fit.mesh.vertices)) + 10.0 * (
         find_exchanged_sides(template, parts, fit.mesh.vertices) is not None)
     return limbs + (lost if lost > 1 else 0.0)
@@ -136,11 +168,11 @@ def weigh_doubts(template: Mesh, parts: PersonParts | None, fit: Registration) -
 def register_unmarked(template: Mesh, scan: Mesh | np.ndarray, config: RegistrationConfig | None = None,
                       search: CorrelatedConfig | None = None, progress: Callable[[int, int], None] | None = None
                       ) -> tuple[Registration, Correspondences]:
-    """Bring a template onto a scan that has no landmarks; and the correspondences that led it.
+    """Register a template to a scan without landmarks; return the registration and its correspondences.
 
-    Correspondences that are sure may leave out a limb, a forearm bent upwards, say, which then stays beside its scan.
-    A scan that is not all covered is registered again with the ends of its limbs as landmarks, and the registration
-    that covers more is kept. ValueError as from `find_correspondences` and `register`.
+    Confident correspondences may miss a limb, such as a raised forearm, which then stays off its scan. So a scan that
+    is not fully covered is registered again with its limb ends as landmarks, and the better covering result is kept.
+    ValueError as from `find_correspondences` and `register`.
     """
     seeds = find_seeds(template, scan)
     ends = seeds.template_vertices, seeds.scan_points
@@ -149,5 +181,5 @@ def register_unmarked(template: Mesh, scan: Mesh | np.ndarray, config: Registrat
     if fit.uncovered > UNCOVERED:
         again = register(template, scan, ends, config, progress, pairs)
         if again.uncovered < fit.uncovered:
-            fit = replace(again, landmark_rms=np.nan)                # nobody clicked them
+            fit = replace(again, landmark_rms=np.nan)                # these landmarks were not clicked
     return fit, pairs

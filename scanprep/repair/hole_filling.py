@@ -1,4 +1,4 @@
-"""Holes closed by fair patches [Liepa], or along a surface diffused through a volume [Davis]."""
+"""Fill holes with fair patches [Liepa], or along a surface diffused through a volume [Davis]."""
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
@@ -18,7 +18,7 @@ from .manifold import repair, split_vertices
 from .volumetric_diffusion import EMPTY, diffuse_surface
 
 Method = Literal["auto", "fair", "diffusion", "poisson-open3d", "poisson-pymeshlab"]
-MOST_EMPTY = 0.02                    # share of a good patch that may lie in space that was seen to be empty
+MOST_EMPTY = 0.02                    # share of a good patch that may violate free space: noise of depth cameras
 
 
 @dataclass(frozen=True)
@@ -28,18 +28,23 @@ class FillConfig(Settings):
     Attributes
     ----------
     method : "auto", "fair", "diffusion", "poisson-open3d" or "poisson-pymeshlab"
-        Fair patches, or patches drawn to a surface diffused through a volume; "auto" makes fair patches and, where
-        lines of sight are known, tries diffusion for one that fills space seen to be empty or runs through
-        something. Without them diffusion did not win a single hole that we measured, and takes long.
-        Screened Poisson reconstruction remeshes everything and needs the named library.
+        Fair patches, or patches pulled to a surface diffused through a volume. "auto" makes fair patches; where lines
+        of sight are known, it tries diffusion if a patch violates free space or intersects something. Without lines of
+        sight diffusion was never better on the holes that we measured, and it is slow. Screened Poisson reconstruction
+        remeshes everything and needs the named library.
     max_edges : int, optional
-        Longer borders stay open.
+        Holes with longer borders stay open.
     density : float
         Size of the new triangles relative to those around the hole: larger means finer.
     join : bool
-        Whether borders that face each other, as those of a limb that was cut through, are joined by one patch.
+        Whether borders that face each other, as at a limb that was cut through, are joined by one patch.
     poisson_depth : int
         Octree depth of the Poisson methods.
+
+    Examples
+    --------
+    >>> FillConfig(max_edges=200).method
+    'auto'
     """
 
     method: Method = "auto"
@@ -50,28 +55,29 @@ class FillConfig(Settings):
 
 
 class FilledHole(NamedTuple):
-    """What was done about one hole."""
+    """How one hole was filled."""
 
     centre: np.ndarray          # (3,) metres
-    borders: int                # closed borders that one patch joins
+    borders: int                # closed borders joined by the patch
     edges: int                  # their length in edges
     method: str                 # "fair" or "diffusion"
-    intersections: int          # pairs of triangles, one of them new, that run through each other in the end
-    in_empty: float             # share of the new vertices in space that the views saw to be empty; 0 without views
+    intersections: int          # pairs of intersecting triangles, one of them new
+    in_empty: float             # share of the new vertices that violate free space; 0 without views
 
     @property
     def faults(self) -> tuple[bool, int, float]:
-        """What a patch is judged by, the lower the better: too much of it where nothing can be, and the rest."""
+        """Faults of a patch, lower is better: too much in free space, intersections, share in free space."""
         return self.in_empty > MOST_EMPTY, self.intersections, self.in_empty
 
     @property
     def is_bad(self) -> bool:
+        """Whether the patch intersects something or violates free space."""
         return bool(self.intersections) or self.in_empty > MOST_EMPTY
 
 
 @dataclass(frozen=True, eq=False)
 class FillReport:
-    """A filled mesh, whose old vertices and triangles come first, untouched, and how each hole was filled."""
+    """A filled mesh, with the old vertices and triangles first and unchanged, and how each hole was filled."""
 
     mesh: Mesh
     holes: tuple[FilledHole, ...]           # longest border first
@@ -81,26 +87,36 @@ def fill_holes(mesh: Mesh, config: FillConfig | None = None,
                progress: Callable[[int, int], None] | None = None) -> Mesh:
     """Close the holes of a mesh.
 
-    Each hole gets the triangulation that bends least, is refined to the size of the triangles around it, and
-    faired so that it continues the surface. `fill_report` tells what was done about each.
+    Each hole gets the triangulation that bends least. It is refined to the size of the triangles around it, and faired
+    so that it continues the surface. `fill_report` also reports how each hole was filled.
 
     Parameters
     ----------
     mesh : Mesh
         Edge-manifold; borders may touch in a vertex (see `repair`).
     config : FillConfig, optional
-    progress : callback(done, total), optional
+        Settings.
+    progress : callable, optional
+        Called as progress(done, total).
 
     Returns
     -------
     Mesh
-        Except with the Poisson methods, the vertices and triangles of `mesh` come first, untouched. Vertices
-        where separate sheets touch are doubled.
+        Vertices in metres. Except with the Poisson methods, the vertices and triangles of `mesh` come first, unchanged.
+        Vertices where separate sheets touch are duplicated.
 
     Raises
     ------
     ValueError
         The mesh is empty or not manifold along its edges, or the method is unknown.
+
+    Examples
+    --------
+    >>> open_box = Mesh([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0], [0, 0, 1], [1, 0, 1], [1, 1, 1], [0, 1, 1]], [
+    ...     [0, 2, 1], [0, 3, 2], [0, 1, 5], [0, 5, 4], [1, 2, 6], [1, 6, 5], [2, 3, 7], [2, 7, 6], [3, 0, 4],
+    ...     [3, 4, 7]])
+    >>> open_box.is_closed, fill_holes(open_box).is_closed
+    (False, True)
 
     [Liepa] triangulation, refinement, fairing
     [Davis] volumetric diffusion
@@ -109,19 +125,19 @@ def fill_holes(mesh: Mesh, config: FillConfig | None = None,
     if config.method.startswith("poisson"):
         _check(mesh, config)
         if config.method == "poisson-open3d":
-            pass
+            from ..adapters.open3d_filters import open3d_poisson as poisson
         else:
-            from ..adapters.pymeshlab_filters import meshlab_poisson
-        return close(meshlab_poisson(mesh, config.poisson_depth))
+            from ..adapters.pymeshlab_filters import meshlab_poisson as poisson
+        return close(poisson(mesh, config.poisson_depth))
     return fill_report(mesh, config, progress).mesh
 
 
 def fill_report(mesh: Mesh, config: FillConfig | None = None, progress: Callable[[int, int], None] | None = None,
                 views: Sequence[Any] = ()) -> FillReport:
-    """Close the holes of a mesh and tell how; as `fill_holes`, for the methods that keep the mesh.
+    """Close the holes of a mesh and report how; like `fill_holes`, for the methods that keep the mesh.
 
-    Fair patches for all holes together; then those that are not good enough one by one in a volume. The mesh was merged
-    from the views, RangeView or pairs (Mesh, camera position (3,)): space they look through is left empty.
+    Fair patches fill all holes together. Then holes with bad patches are filled one by one in a volume. `views` are
+    those that the mesh was merged from, RangeView or pairs (Mesh, camera position (3,)): their free space stays empty.
 
     [Liepa] triangulation, refinement, fairing
     [Davis] volumetric diffusion
@@ -132,50 +148,50 @@ def fill_report(mesh: Mesh, config: FillConfig | None = None, progress: Callable
         raise ValueError(f"config.method: {config.method} remeshes everything; there are no single holes to report")
     if not mesh.is_edge_manifold:
         raise ValueError("mesh: expected at most two triangles at an edge, facing the same way; repair it first")
-    # the holes: borders, and which of them one patch joins
+    # find the borders, and group those that one patch joins
     mesh = split_vertices(mesh, across_holes=True)
     loops = [loop for loop in mesh.boundary_loops if len(loop) <= (config.max_edges or len(mesh.vertices))]
     if not loops:
         return FillReport(split_vertices(mesh), ())
     groups = group_loops(mesh, loops) if config.join else [[loop] for loop in loops]
     work = _Filling(mesh, config, SeenSpace(views) if len(views) else None, Rays(mesh))
-    # fair patches for all of them; holes with a bad one, or all where only diffusion is wanted, are left open
+    # fair patches for all holes; those with a bad patch, or all if only diffusion is asked for, are left open
     fair = list[FilledHole | None]([None] * len(groups))
     filled = mesh
     if config.method != "diffusion":
         filled = work.fair_patches(mesh, groups, progress=progress)
         fair = [*work.rate(filled, mesh, groups, "fair")]
-    seen_in = config.method == "auto" and len(views) > 0
-    made = {g: hole for g, hole in enumerate(fair) if hole is not None and not (seen_in and hole.is_bad)}
-    if 0 < len(made) < len(groups):
-        filled = work.fair_patches(mesh, [groups[g] for g in made])
-    elif not made:
+    retry_bad = config.method == "auto" and len(views) > 0
+    done = {g: hole for g, hole in enumerate(fair) if hole is not None and not (retry_bad and hole.is_bad)}
+    if 0 < len(done) < len(groups):
+        filled = work.fair_patches(mesh, [groups[g] for g in done])
+    elif not done:
         filled = mesh
-    # volumetric diffusion, one hole after the other
+    # volumetric diffusion for the others, one by one
     for g, group in enumerate(groups):
-        if g not in made:
-            filled, made[g] = work.diffuse(filled, group, fair[g])
+        if g not in done:
+            filled, done[g] = work.diffuse(filled, group, fair[g])
             if progress:
-                progress(len(made), len(groups))
-    return FillReport(split_vertices(filled), tuple(made[g] for g in range(len(groups))))
+                progress(len(done), len(groups))
+    return FillReport(split_vertices(filled), tuple(done[g] for g in range(len(groups))))
 
 
 def filling_judgement(holes: Sequence[FilledHole], triangles: int) -> Judgement:
-    """What patches of so many triangles are worth: those of views that lie over each other run through the others."""
+    """Judge patches with `triangles` triangles; patches across overlapping views intersect other triangles."""
     crossing = sum(hole.intersections for hole in holes)
     reason = (f"the patches have {triangles} triangles and run through others {crossing} times: views that overlap "
               "are to be made one surface first (scape prep merge, scape prep template)")
-    # pairs that run through each other, for each new triangle: merged views of people have 0.001 and 0.003, four
-    # views that lie over each other 2.5, where patches are a cape from hand to hand
+    # intersections per new triangle: merged views of people have 0.001 and 0.003. Four overlapping views have 2.5, with
+    # patches like a cape from hand to hand.
     if crossing > 0.5 * triangles:
         return Judgement.of(reason)
     return Judgement.of(check=[reason] if crossing > 0.05 * triangles else [])
 
 
 def close(mesh: Mesh, config: FillConfig | None = None) -> Mesh:
-    """One closed manifold component: repair and fill in turns, until nothing is open or defective.
+    """Make one closed manifold component: repair and fill in turns until nothing is open or defective.
 
-    What repair opens after the first filling is filled with fair patches.
+    Holes that repair opens after the first filling get fair patches.
     """
     mesh = fill_holes(repair(mesh), config)
     for _ in range(4):
@@ -186,6 +202,7 @@ def close(mesh: Mesh, config: FillConfig | None = None) -> Mesh:
 
 
 def _check(mesh: Mesh, config: FillConfig) -> None:
+    """Raise ValueError for a mesh without triangles or an unknown method."""
     if not len(mesh.faces):
         raise ValueError("mesh: expected a surface with holes, got one without triangles")
     if config.method not in get_args(Method):
@@ -194,7 +211,7 @@ def _check(mesh: Mesh, config: FillConfig) -> None:
 
 @dataclass(frozen=True, eq=False)
 class _Filling:
-    """Patches for the holes of one mesh."""
+    """Makes patches for the holes of one mesh, and rates them."""
 
     mesh: Mesh
     config: FillConfig
@@ -203,17 +220,18 @@ class _Filling:
 
     def fair_patches(self, mesh: Mesh, groups: list[list[np.ndarray]], guide: Mesh | None = None,
                      progress: Callable[[int, int], None] | None = None) -> Mesh:
-        """The mesh with fair patches across some holes, drawn to a guide if there is one.
+        """Fill some holes with fair patches, pulled to a guide surface if there is one.
 
         [Liepa] triangulation, refinement, fairing
         """
         rim = np.zeros(len(mesh.vertices), dtype=bool)
         rim[np.concatenate([loop for group in groups for loop in group])] = True
-        around, used = mesh.submesh(rim[mesh.faces].any(axis=1))      # all that the patches have to know
+        around, used = mesh.submesh(rim[mesh.faces].any(axis=1))      # a patch depends on these triangles only
         local = np.full(len(mesh.vertices), -1)
         local[used] = np.arange(len(used))
         patch = Patch(around, rim[used])
         polygons = [join_polygons(around.vertices, [local[loop] for loop in group]) for group in groups]
+        # triangulate, refine, fair, and undo fairing where it makes intersections
         patch.triangulate(polygons, self.rays, progress)
         patch.refine(self.config.density)
         start = patch.mesh.vertices
@@ -221,7 +239,7 @@ class _Filling:
         patch.untangle(start)
         if guide is not None and len(guide.faces):
             surface, start = Surface(guide), patch.mesh.vertices
-            for _ in range(4):
+            for _ in range(4):                     # alternate closest points on the guide and fairing with a pull
                 new = patch.mesh.vertices[patch.old_vertices:]
                 patch.fair(surface.closest(new).points if len(new) else new, 3e3)
             patch.untangle(start)
@@ -229,11 +247,11 @@ class _Filling:
 
     def diffuse(self, mesh: Mesh, group: list[np.ndarray], fair: FilledHole | None
                 ) -> tuple[Mesh, FilledHole]:
-        """The mesh with one hole filled by diffusion, unless the fair patch was better.
+        """Fill one hole by diffusion, unless the fair patch is better.
 
         [Davis] volumetric diffusion
         """
-        # the part of the mesh within four radii of the hole, and the vertices of its border there
+        # the guide depends on the mesh within four radii of the hole
         rim = np.concatenate(group)
         middle = mesh.vertices[rim].mean(axis=0)
         reach = 4 * np.linalg.norm(mesh.vertices[rim] - middle, axis=1).max()
@@ -241,14 +259,15 @@ class _Filling:
         part, used = mesh.submesh(near | np.isin(mesh.faces, rim).any(axis=1))
         guide = diffuse_surface(part, np.searchsorted(used, np.unique(rim)), self.seen)
         filled = self.fair_patches(mesh, [group], guide)
-        made = self.rate(filled, mesh, [group], "diffusion")[0]
-        if fair is None or made.faults < fair.faults:
-            return filled, made
+        diffused = self.rate(filled, mesh, [group], "diffusion")[0]
+        if fair is None or diffused.faults < fair.faults:
+            return filled, diffused
         return self.fair_patches(mesh, [group]), fair
 
     def rate(self, filled: Mesh, before: Mesh, groups: list[list[np.ndarray]], method: str) -> list[FilledHole]:
-        """What was done about every hole, and what is wrong with its patch."""
+        """Report how every hole was filled, with the faults of its patch."""
         old = len(before.faces)
+        # every patch is one component of the new triangles
         label = Mesh(filled.vertices, filled.faces[old:]).vertex_component
         pairs = intersecting_faces(filled, np.arange(old, len(filled.faces)))
         crossing = np.bincount(label[filled.faces[pairs.max(axis=1), 0]], minlength=label.max() + 1)

@@ -1,4 +1,4 @@
-"""Borders of holes: which are borders of one hole, and the triangles across one closed loop of points [Liepa]."""
+"""Group borders into holes, and triangulate closed loops of points [Liepa]."""
 from __future__ import annotations
 
 import heapq
@@ -10,16 +10,16 @@ from ..geometry.sparse import label_components
 
 
 def group_loops(mesh: Mesh, loops: list[np.ndarray]) -> list[list[np.ndarray]]:
-    """Borders that face each other put together, as the two ends where a limb was cut through; order as of `loops`."""
-    large = [number for number, loop in enumerate(loops) if len(loop) >= 6]    # others are pinholes
+    """Group borders that face each other, as the two ends where a limb was cut through; in the order of `loops`."""
+    large = [number for number, loop in enumerate(loops) if len(loop) >= 6]    # smaller ones are pinholes
     label = np.arange(len(loops))
     if len(large) > 1:
         points = np.concatenate([mesh.vertices[loops[number]] for number in large])
         owner = np.repeat(large, [len(loops[number]) for number in large])
         ahead = np.concatenate([_outward(mesh, loops[number]) for number in large])
-        facing = np.array([_met(points, owner, ahead, number, len(loops)) for number in large])
+        facing = np.array([_facing_shares(points, owner, ahead, number, len(loops)) for number in large])
         both = np.zeros((len(loops), len(loops)), dtype=bool)
-        both[large] = facing > 0.6
+        both[large] = facing > 0.6            # most vertices of one border must see the other, and vice versa
         a, b = np.nonzero(both & both.T)
         label = label_components(a, b, len(loops))
     return [[loops[k] for k in np.flatnonzero(label == label[number])]
@@ -27,9 +27,9 @@ def group_loops(mesh: Mesh, loops: list[np.ndarray]) -> list[list[np.ndarray]]:
 
 
 def join_polygons(vertices: np.ndarray, loops: list[np.ndarray]) -> np.ndarray:
-    """One polygon (m,) from several loops, cut open along the shortest lines between them.
+    """Join several loops into one polygon (m,), with cuts along the shortest lines between them.
 
-    The vertices at the ends of a cut are named twice. All loops run as the sides of the triangles at the border do.
+    The vertices at the ends of a cut appear twice. All loops run in the direction of the border triangles' sides.
     """
     polygon = loops[0]
     rest = list(loops[1:])
@@ -43,45 +43,45 @@ def join_polygons(vertices: np.ndarray, loops: list[np.ndarray]) -> np.ndarray:
 
 
 def _outward(mesh: Mesh, loop: np.ndarray) -> np.ndarray:
-    """(n, 3) unit directions in which the surface would go on at the vertices of a border."""
+    """Estimate unit directions (n, 3) in which the surface would continue at the vertices of a border."""
     v = mesh.vertices[loop]
     along = np.roll(v, -1, axis=0) - np.roll(v, 1, axis=0)
     out = np.cross(along, mesh.vertex_normals[loop])
-    for _ in range(3):                                        # jagged borders point everywhere
+    for _ in range(3):                                        # smooth, as jagged borders point everywhere
         out = out + np.roll(out, 1, axis=0) + np.roll(out, -1, axis=0)
     return np.asarray(out / np.maximum(np.linalg.norm(out, axis=1, keepdims=True), 1e-30))
 
 
-def _met(points: np.ndarray, owner: np.ndarray, ahead: np.ndarray, number: int, count: int) -> np.ndarray:
-    """(count,) for one border, the share of its vertices that have each border ahead of them as the next thing.
+def _facing_shares(points: np.ndarray, owner: np.ndarray, ahead: np.ndarray, number: int, count: int) -> np.ndarray:
+    """Compute for one border the shares (count,) of its vertices that face each other border.
 
-    Only a border closer than this one is wide counts.
+    A vertex faces the nearest border ahead of it, within 45 degrees and closer than its own border is wide.
     """
-    mine = owner == number
-    apart = points[None] - points[mine][:, None]
+    own = owner == number
+    apart = points[None] - points[own][:, None]
     far = np.linalg.norm(apart, axis=2)
-    width = np.linalg.norm(np.ptp(points[mine], axis=0))
-    straight = np.einsum("abd,ad->ab", apart, ahead[mine]) > 0.7 * far
+    width = np.linalg.norm(np.ptp(points[own], axis=0))
+    straight = np.einsum("abd,ad->ab", apart, ahead[own]) > 0.7 * far
     far = np.where(straight & (far > 0) & (far < width), far, np.inf)
     next_one = far.argmin(axis=1)
-    met = owner[next_one][np.isfinite(far.min(axis=1))]
-    shares = np.bincount(met, minlength=count) / mine.sum()
+    faced = owner[next_one][np.isfinite(far.min(axis=1))]
+    shares = np.bincount(faced, minlength=count) / own.sum()
     shares[number] = 0
     return np.asarray(shares)
 
 
 def triangulate_loop(points: np.ndarray, rim_normals: np.ndarray, forbidden: np.ndarray,
                      price: np.ndarray | None = None) -> np.ndarray | None:
-    """The triangles (n - 2, 3) across a loop (n, 3) that bend least and, where nothing bends, have the smallest area.
+    """Find the triangulation (n - 2, 3) of a loop (n, 3) that bends least and, if nothing bends, has the smallest area.
 
-    An edge of length l between triangles whose normals have the cosine c costs l (1 - c)²: a few sharp bends are
-    dearer than many soft ones, but a crease along the bottom of an armpit is cheaper than a web across it, which
-    bends sharply along both of its sides. Dynamic programming over all triangulations, O(n³); of longer loops,
-    ears are cut off first.
+    An edge of length l between triangles whose normals have the cosine c costs l (1 - c)². So a few sharp bends cost
+    more than many soft ones. A crease along the bottom of an armpit costs less than a web across it, which bends
+    sharply along both of its sides. Dynamic programming covers all triangulations in O(n³). Longer loops lose ears
+    first.
 
-    The loop runs as the new triangles do; `rim_normals` (n, 3) are those of the surface beyond each edge i, i + 1.
-    Pairs that are `forbidden` (n, n), because an edge joins them already, are not joined, and joining costs `price`
-    (n, n), metres, beside the bend. None when every triangulation needs a forbidden edge.
+    The loop runs in the direction of the new triangles. `rim_normals` (n, 3) are those of the surface beyond each edge
+    i, i + 1. Pairs that are `forbidden` (n, n), because they have an edge already, get none. A new edge also costs
+    `price` (n, n), metres. Returns None when every triangulation needs a forbidden edge.
 
     [Liepa] hole triangulation
     """
@@ -93,11 +93,12 @@ def triangulate_loop(points: np.ndarray, rim_normals: np.ndarray, forbidden: np.
 
 
 def _least_weight(p: np.ndarray, rim: np.ndarray, forbidden: np.ndarray, price: np.ndarray) -> np.ndarray | None:
+    """Find the least-cost triangulation by dynamic programming over spans of the loop; None if all are forbidden."""
     n = len(p)
     cost = np.full((n, n), np.inf)
     normal, choice = np.zeros((n, n, 3)), np.zeros((n, n), dtype=np.int64)
     apart = np.linalg.norm(p[:, None] - p, axis=2)
-    # what the area, over the size of the loop, adds to the bends: it decides where all is flat
+    # small weight of the area, per size of the loop: it decides where everything is flat
     per_area = 0.01 / max(float(np.linalg.norm(p - p.mean(axis=0), axis=1).mean()), 1e-30)
     first = np.arange(n - 1)
     cost[first, first + 1] = 0
@@ -107,6 +108,7 @@ def _least_weight(p: np.ndarray, rim: np.ndarray, forbidden: np.ndarray, price: 
         return np.asarray((1 - np.einsum("...d,...d", a, b)) ** 2)
 
     for span in range(2, n):
+        # for every span i..k and every tip m: both sub-spans, the area, and the bends across i m and m k
         i = np.arange(n - span)[:, None]
         k = i + span
         m = i + np.arange(1, span)[None]
@@ -117,6 +119,7 @@ def _least_weight(p: np.ndarray, rim: np.ndarray, forbidden: np.ndarray, price: 
         total += apart[i, m] * bend(across, normal[i, m]) + apart[m, k] * bend(across, normal[m, k])
         if span == n - 1:
             total += apart[i, k] * bend(across, rim[-1])
+        # keep the best tip; a forbidden chord makes the span impossible
         best = total.argmin(axis=1)
         row = np.arange(n - span)
         i, k = i[:, 0], k[:, 0]
@@ -125,6 +128,7 @@ def _least_weight(p: np.ndarray, rim: np.ndarray, forbidden: np.ndarray, price: 
         normal[i, k], choice[i, k] = across[row, best], best + i + 1
     if not np.isfinite(cost[0, n - 1]):
         return None
+    # read the triangles back from the choices
     triangles, stack = [], [(0, n - 1)]
     while stack:
         start, end = stack.pop()
@@ -137,7 +141,7 @@ def _least_weight(p: np.ndarray, rim: np.ndarray, forbidden: np.ndarray, price: 
 
 def _cut_ears(points: np.ndarray, rim: np.ndarray, forbidden: np.ndarray
               ) -> tuple[np.ndarray, list[tuple[int, int, int]]]:
-    """Cut corners that point away from the hole, shortest new edge first, until at most LARGEST are left."""
+    """Cut convex corners (ears), shortest new edge first, until at most 120 vertices remain; return both."""
     n = len(points)
     after, before = (np.arange(n) + 1) % n, np.arange(n) - 1
     before[0] = n - 1
@@ -145,22 +149,23 @@ def _cut_ears(points: np.ndarray, rim: np.ndarray, forbidden: np.ndarray
     alive, ears = np.ones(n, dtype=bool), []
 
     def entry(i: int) -> tuple[float, int, int, int] | None:
+        """Return the queue entry of corner i, or None if it must not be cut."""
         a, b = int(before[i]), int(after[i])
         across = np.cross(points[i] - points[a], points[b] - points[a])
         if forbidden[a, b] or across @ normal[i] <= 0.2 * np.linalg.norm(across) * np.linalg.norm(normal[i]):
             return None
         return float(np.linalg.norm(points[a] - points[b])), i, a, b
 
-    largest = 120  # vertices of a loop whose triangulation is found by dynamic programming as a whole
+    largest = 120  # longer loops would make the O(n³) dynamic programming slow
     heap = [e for e in map(entry, range(n)) if e] if n > largest else []
     heapq.heapify(heap)
-    left = n
-    while heap and left > largest:
+    remaining = n
+    while heap and remaining > largest:
         _, i, a, b = heapq.heappop(heap)
         if not alive[i] or before[i] != a or after[i] != b:
             continue
         ears.append((a, i, b))
-        alive[i], after[a], before[b], left = False, b, a, left - 1
+        alive[i], after[a], before[b], remaining = False, b, a, remaining - 1
         for fresh in filter(None, map(entry, (a, b))):
             heapq.heappush(heap, fresh)
     return np.flatnonzero(alive), ears
@@ -168,7 +173,7 @@ def _cut_ears(points: np.ndarray, rim: np.ndarray, forbidden: np.ndarray
 
 def _chord_normals(points: np.ndarray, rim: np.ndarray, kept: np.ndarray, ears: list[tuple[int, int, int]]
                    ) -> np.ndarray:
-    """Normals beyond the edges of the loop that is left after cutting ears."""
+    """Return the normals beyond the edges of the loop after cutting ears."""
     of_edge = {(i, (i + 1) % len(points)): rim[i] for i in range(len(points))}
     for a, i, b in ears:
         across = np.cross(points[i] - points[a], points[b] - points[a])

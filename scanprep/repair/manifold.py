@@ -1,4 +1,4 @@
-"""Meshes made manifold: no double or flat triangles, no sheets that touch, no loose pieces."""
+"""Make meshes manifold: no duplicate or degenerate triangles, no touching sheets, no small components."""
 from __future__ import annotations
 
 import numpy as np
@@ -8,30 +8,33 @@ from ..geometry.sanitise import invert_against_neighbours, invert_triangles
 from ..geometry.sparse import label_components
 from ..geometry.surface import Rays
 
-FLAT = 1e-12               # square metres: no area
+FLAT = 1e-12               # square metres; triangles with less area are degenerate
 
 
 def repair(mesh: Mesh, min_component: float = 1.0) -> Mesh:
-    """The nearest mesh that is manifold, with nothing double, flat, unused or loose in it.
+    """Repair a mesh to a manifold without duplicate, degenerate or unused elements and small components.
 
-    Triangles are inverted where neighbours disagree and else only ever removed, so holes may open; where sheets
-    touch in a vertex it is split in two.
+    Triangles are inverted where neighbours disagree, and otherwise only removed, so holes may open. A vertex where
+    sheets touch is split.
 
     Parameters
     ----------
     mesh : Mesh
+        Any triangle mesh.
     min_component : float
-        Pieces with a smaller share of the vertices of the largest one are dropped; 1 keeps the largest alone.
+        Components with a smaller share of the vertices of the largest one are dropped; 1 keeps only the largest.
 
     Returns
     -------
     Mesh
+        Vertices in metres; colours are kept.
 
     Raises
     ------
     ValueError
         No triangle is left.
     """
+    # weld, drop degenerate triangles, orient; remove triangles at bad edges until the edges are manifold
     mesh = orient_triangles(_drop_flat(weld(mesh, 1e-7)))
     for _ in range(20):
         if mesh.is_edge_manifold:
@@ -44,7 +47,8 @@ def repair(mesh: Mesh, min_component: float = 1.0) -> Mesh:
 
 
 def weld(mesh: Mesh, distance: float = 0.0) -> Mesh:
-    """Vertices closer than `distance` metres made one, without triangles that lose a corner by it or are repeated."""
+    """Merge vertices closer than `distance` metres, and drop triangles that become degenerate or duplicate."""
+    # equal keys become one vertex, the first of them
     key = np.round(mesh.vertices / distance) if distance > 0 else mesh.vertices
     rows = np.lexsort(key.T)
     new = np.empty(len(key), dtype=np.int64)
@@ -64,7 +68,7 @@ def weld(mesh: Mesh, distance: float = 0.0) -> Mesh:
 
 
 def _drop_flat(mesh: Mesh) -> Mesh:
-    """Triangles without area removed by collapsing their shortest side, where that harms no neighbour."""
+    """Remove degenerate triangles by collapsing their shortest side; what is left after ten rounds is dropped."""
     for _ in range(10):
         flat = np.flatnonzero(mesh.face_areas < FLAT)
         if not len(flat):
@@ -81,18 +85,18 @@ def _drop_flat(mesh: Mesh) -> Mesh:
 
 
 def orient_triangles(mesh: Mesh) -> Mesh:
-    """Triangles inverted so that neighbours face the same way, in every patch the way most of its area does."""
+    """Invert triangles so that neighbours face the same way: in every patch the way of most of its area."""
     invert, _ = invert_against_neighbours(mesh)
     return Mesh(mesh.vertices, invert_triangles(mesh.faces, invert), mesh.colors) if invert.any() else mesh
 
 
 def _drop_at_bad_edges(mesh: Mesh) -> Mesh:
-    """Without the triangles that make an edge non-manifold; of two that use it in one direction the smaller."""
+    """Remove the triangles that make an edge non-manifold: of two in one direction, the smaller."""
     half = mesh.faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
     edge = mesh.face_edges.ravel()
     forward = half[:, 0] < half[:, 1]
     size = np.repeat(mesh.face_areas, 3)
-    # In each direction an edge may be used once: the largest triangle keeps it.
+    # an edge may be used once in each direction: the largest triangle keeps it
     order = np.lexsort((-size, forward, edge))
     e, f = edge[order], forward[order]
     again = np.r_[False, (e[1:] == e[:-1]) & (f[1:] == f[:-1])]
@@ -102,14 +106,15 @@ def _drop_at_bad_edges(mesh: Mesh) -> Mesh:
 
 
 def split_vertices(mesh: Mesh, across_holes: bool = False) -> Mesh:
-    """A copy of a vertex for every fan of triangles around it beyond the first.
+    """Split vertices: every fan of triangles around a vertex beyond the first gets a copy.
 
-    `across_holes` leaves fans together that will be one when the holes between them are filled.
+    `across_holes` keeps fans together that become one when the holes between them are filled.
     """
     if mesh.is_vertex_manifold:
         return mesh
     fan = mesh.corner_fans
     number = (_join_across_holes(mesh, fan)[fan] if across_holes else fan).ravel()
+    # the first fan keeps the vertex, the others get new numbers at the end
     _, first, new = np.unique(number, return_index=True, return_inverse=True)
     owner = mesh.faces.ravel()[first]
     order = np.lexsort((first, owner))
@@ -122,7 +127,7 @@ def split_vertices(mesh: Mesh, across_holes: bool = False) -> Mesh:
 
 
 def _join_across_holes(mesh: Mesh, fan: np.ndarray) -> np.ndarray:
-    """A common number for the fans at a vertex between which a simple border loop passes."""
+    """Give the same number to the fans at a vertex between which a simple border loop passes."""
     face, side = np.nonzero(mesh.edge_use[mesh.face_edges] == 1)
     ends = mesh.faces[face, side], mesh.faces[face, (side + 1) % 3]
     at = {(int(a), int(b)): (int(p), int(q)) for a, b, p, q in
@@ -134,7 +139,7 @@ def _join_across_holes(mesh: Mesh, fan: np.ndarray) -> np.ndarray:
 
 
 def drop_small_components(mesh: Mesh, share: float) -> Mesh:
-    """Without the pieces that have less than `share` of the vertices of the largest, and unused vertices."""
+    """Drop components with less than `share` of the vertices of the largest, and unused vertices."""
     if not len(mesh.faces):
         return mesh
     a, b = mesh.faces[:, [0, 1]].T, mesh.faces[:, [1, 2]].T       # not mesh.edges: sorting them takes longer
@@ -147,12 +152,13 @@ def drop_small_components(mesh: Mesh, share: float) -> Mesh:
 
 
 def drop_thin(mesh: Mesh, thinnest: float) -> Mesh:
-    """Without what is thinner than `thinnest` metres, as fingers are that were hardly seen, and what hung on it.
+    """Drop parts thinner than `thinnest` metres, such as poorly seen fingers, and what was attached to them.
 
-    Thickness is measured along the inward normals; the rest is open where something was taken off.
+    Thickness is measured along the inward normals. The surface is open where something was removed.
     """
     middle = mesh.corners.mean(axis=1)
     inward = -mesh.face_normals
+    # from just below the surface; only distances up to ten times the limit matter
     _, depth = Rays(mesh).cast(middle + 1e-4 * inward, inward, 10 * thinnest)
     thick = ~(depth < thinnest)
     return drop_small_components(mesh.submesh(thick)[0], 1.0) if not thick.all() else mesh

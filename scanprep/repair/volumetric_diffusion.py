@@ -1,4 +1,4 @@
-"""The surface continued through holes in a volume [Davis]."""
+"""Continue a surface through holes by volumetric diffusion [Davis]."""
 from __future__ import annotations
 
 import numpy as np
@@ -8,19 +8,20 @@ from ..geometry.mesh import Mesh
 from ..geometry.sparse import factor
 from ..geometry.surface import SeenSpace, Surface
 
-EMPTY = 0.01                         # metres in front of what was seen from which on space counts as empty
+EMPTY = 0.01                         # metres in front of a seen surface from which on space is free; noise is smaller
 
 
 def diffuse_surface(mesh: Mesh, rim: np.ndarray, seen: SeenSpace | None = None, voxels: int = 12) -> Mesh:
-    """The zero level of the signed distance, diffused from the existing surface into the space about holes.
+    """Diffuse the signed distance from the existing surface into holes, and extract its zero level.
 
-    Near the surface the distance is known. Elsewhere it takes the steady state of diffusion; that of second order,
-    in which the level sets run on in their direction instead of taking the shortest way. Space that was seen to
-    be empty keeps a positive distance. Existing surface and patches come together, as far as the volume reaches: at
-    most `voxels` along the longest side of the holes, whose borders `rim` (n,) are, and never finer than the mesh.
+    Near the surface the distance is known. Elsewhere it is the steady state of second-order diffusion, in which level
+    sets continue in their direction instead of taking the shortest way. Free space keeps a positive distance. The
+    result contains existing surface and patches within the volume. The volume has at most `voxels` along the longest
+    side of the holes with borders `rim` (n,), and is never finer than the mesh.
 
     [Davis] volumetric diffusion, line-of-sight constraints
     """
+    # a grid around the holes, with a margin of five voxels
     points = mesh.vertices[rim]
     extent = np.ptp(points, axis=0).max()
     voxel = max(float(extent) / voxels, mesh.mean_edge)
@@ -28,11 +29,13 @@ def diffuse_surface(mesh: Mesh, rim: np.ndarray, seen: SeenSpace | None = None, 
     low = points.min(axis=0) - margin
     shape = np.ceil((np.ptp(points, axis=0) + 2 * margin) / voxel).astype(int) + 1
     grid = low + voxel * np.stack(np.unravel_index(np.arange(np.prod(shape)), shape), axis=1)
+    # fix the distance within three voxels of the surface, and diffuse it into the rest
     distance, sure = measure_signed_distance(mesh, grid)
     known = sure & (np.abs(distance) <= 3 * voxel)
     operator = _roughness(tuple(shape.tolist()))
     values = _spread(operator, known, distance)
     if seen is not None:
+        # free space that came out inside gets a positive distance, and diffusion is repeated
         empty = ~known & (seen.ahead(grid) > max(EMPTY, voxel))
         for _ in range(6):
             wrong = empty & ~known & (values < voxel)
@@ -44,18 +47,18 @@ def diffuse_surface(mesh: Mesh, rim: np.ndarray, seen: SeenSpace | None = None, 
 
 
 def _zero_surface(grid: np.ndarray, values: np.ndarray, shape: np.ndarray) -> Mesh:
-    """Where values (N,) on a full grid (N, 3) of a shape change sign."""
+    """Extract the surface where values (N,) on a full grid (N, 3) change sign."""
     import igl
 
-    values = np.where(np.abs(values) < 1e-4, 1e-4, values)      # a surface through a corner would make flat triangles
+    values = np.where(np.abs(values) < 1e-4, 1e-4, values)      # zeros at corners give degenerate triangles
     order = np.arange(len(values)).reshape(shape).ravel(order="F")             # igl: x runs fastest
     return Mesh(*igl.marching_cubes(values[order], grid[order], *shape.tolist(), 0.0)[:2])
 
 
 def measure_signed_distance(mesh: Mesh, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Distances (n,) in metres of points from a surface with borders, and (n,) bool where they can be trusted.
+    """Compute signed distances (n,), metres, of points from a surface with borders, and where they are reliable (n,).
 
-    Beyond a border inside and outside are not defined: there the closest point lies on the border.
+    Beyond a border, inside and outside are not defined: there the closest point lies on the border.
     """
     at = Surface(mesh).closest(points)
     corners = mesh.faces[at.faces]
@@ -68,7 +71,7 @@ def measure_signed_distance(mesh: Mesh, points: np.ndarray) -> tuple[np.ndarray,
 
 
 def _roughness(shape: tuple[int, ...]) -> csr_array:
-    """(N, N) squared Laplacian of a grid whose sides let nothing through."""
+    """Build the squared Laplacian (N, N) of a grid with zero flux at its sides."""
     number = np.arange(np.prod(shape)).reshape(shape)
     ends = [(number.take(np.arange(size - 1), axis).ravel(), number.take(np.arange(1, size), axis).ravel())
             for axis, size in enumerate(shape)]
@@ -79,7 +82,7 @@ def _roughness(shape: tuple[int, ...]) -> csr_array:
 
 
 def _spread(operator: csr_array, known: np.ndarray, values: np.ndarray) -> np.ndarray:
-    """Values (N,) that are as smooth as possible and keep those that are known."""
+    """Solve for the smoothest values (N,) that keep the known ones."""
     free, fixed = np.flatnonzero(~known), np.flatnonzero(known)
     out = np.array(values)
     rows = operator[free]

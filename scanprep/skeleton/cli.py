@@ -23,7 +23,7 @@ from .tree import Skeleton
 def skeleton(poses: Annotated[Path, Place("POSES")], output: Output, template: Path | None = None,
              subject: Annotated[str | None, Person] = None, unit: Unit | None = None,
              config: SkeletonConfig = SkeletonConfig()) -> Outcome:
-    """Rigid parts, joints and a tree from meshes of one person that share their triangles.
+    """Find rigid parts, joints and a tree from meshes of one person that share their triangles.
 
     Example: scape prep skeleton set -o skeleton.json
 
@@ -81,7 +81,7 @@ def edit(skeleton: Annotated[Path, Place("SKELETON")], output: Output, template:
 
 
 def _read_skeleton(path: Path, template: Path | None, unit: Unit | None) -> tuple[Skeleton, Mesh, np.ndarray | None]:
-    """Skeleton, template, and the poses where a set has them."""
+    """Read a skeleton and its template, and the poses if it is a set that has them."""
     if path.is_dir():
         whole = RegisteredSet.load(path)
         if whole.skeleton is None:
@@ -92,7 +92,8 @@ def _read_skeleton(path: Path, template: Path | None, unit: Unit | None) -> tupl
     return Skeleton.load(path), read_mesh(template, unit), None
 
 
-def _shares(found: Skeleton, body: Mesh) -> list[Metric]:
-    shares = np.bincount(found.part_of_face, body.face_areas, len(found.parents)) / body.face_areas.sum()
+def _shares(skeleton: Skeleton, body: Mesh) -> list[Metric]:
+    """Return one table row per part: its share of the surface."""
+    shares = np.bincount(skeleton.part_of_face, body.face_areas, len(skeleton.parents)) / body.face_areas.sum()
     return [Metric(f"{name}, share of the surface", 100 * float(share), "%")
-            for name, share in zip(found.names, shares, strict=True)]
+            for name, share in zip(skeleton.names, shares, strict=True)]

@@ -1,4 +1,4 @@
-"""Changing a skeleton by hand: merge and split parts, rename them, move joints, one by one or from a file.
+"""Edit a skeleton by hand: merge and split parts, rename them, move joints, one by one or from a file.
 
 A file of edits is JSON, a list carried out from the first to the last:
 
@@ -9,7 +9,7 @@ A file of edits is JSON, a list carried out from the first to the last:
      {"move_joint": "hand_left", "ring": [8120, 8131, 8140]}]
 
 Parts are given by name or by number; numbers are those of the skeleton at that entry. Positions are in metres on the
-template; a ring is a list of its vertices, in whose middle the joint is put. `names` of a split may be left out.
+template. A ring is a list of its vertices; the joint moves to its centre. `names` of a split may be left out.
 """
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ from .tree import Skeleton
 
 
 def find_part_number(skeleton: Skeleton, part: int | str) -> int:
-    """The number of a part that is given by name or number."""
+    """Return the number of a part that is given by name or number; ValueError for an unknown part."""
     names = skeleton.names
     if isinstance(part, str) and part in names:
         return names.index(part)
@@ -42,20 +42,27 @@ def find_part_number(skeleton: Skeleton, part: int | str) -> int:
 
 
 def merge_parts(skeleton: Skeleton, template: Mesh, a: int | str, b: int | str) -> Skeleton:
-    """Two parts as one, called like the first.
+    """Merge two parts into one with the name of the first.
 
-    They are linked, or touch and hang on the same part: then the joint comes to lie between their two.
+    They must be linked, or touch and share a parent. In the second case the joint lies midway between their joints.
 
     Parameters
     ----------
     skeleton : Skeleton
+        The skeleton to edit.
     template : Mesh
-    a, b : names or numbers of parts
+        Its template.
+    a, b : str or int
+        Names or numbers of the parts.
+
+    Returns
+    -------
+    Skeleton
 
     Raises
     ------
     ValueError
-        A part that is not there, twice the same, or parts whose union would close a loop or lie in two pieces.
+        An unknown part, twice the same part, or parts whose union would close a loop or lie in two pieces.
     """
     first, second = find_part_number(skeleton, a), find_part_number(skeleton, b)
     if first == second:
@@ -71,6 +78,7 @@ def merge_parts(skeleton: Skeleton, template: Mesh, a: int | str, b: int | str) 
     joints = skeleton.joints.copy()
     if siblings:
         joints[low] = (joints[low] + joints[high]) / 2
+    # renumber: the higher part disappears, the parts after it move down by one
     new = np.arange(len(parents)) - (np.arange(len(parents)) > high)
     new[high] = new[low]
     keep = np.arange(len(parents)) != high
@@ -81,24 +89,32 @@ def merge_parts(skeleton: Skeleton, template: Mesh, a: int | str, b: int | str) 
 
 def split_part(skeleton: Skeleton, template: Mesh, part: int | str, poses: np.ndarray | None = None,
                names: Sequence[str] | None = None) -> Skeleton:
-    """One part as two: where it bends most in the poses or, without poses, across its length in the middle.
+    """Split one part into two: where it bends most in the poses, or in the middle of its length without poses.
 
-    The half that lies on the old parent (in the root: the larger) keeps number and name; the new one follows it.
-    Children go with the half they share the longer border with.
+    The half next to the parent (in the root: the larger) keeps number and name. The new part follows it. Children go
+    with the half with which they share the longer border.
 
     Parameters
     ----------
     skeleton : Skeleton
+        The skeleton to edit.
     template : Mesh
-    part : name or number
+        Its template.
+    part : str or int
+        Name or number of the part.
     poses : (M, N, 3) float, metres, optional
-    names : two strings, optional
-        Of the half that stays and of the new one.
+        Registered poses of the template.
+    names : two str, optional
+        Names of the half that stays and of the new one.
+
+    Returns
+    -------
+    Skeleton
 
     Raises
     ------
     ValueError
-        A part that is not there, one that the poses do not bend, or names that are taken.
+        An unknown part, one that the poses do not bend, or names that are taken.
     """
     p = find_part_number(skeleton, part)
     label = skeleton.part_of_face
@@ -114,17 +130,19 @@ def split_part(skeleton: Skeleton, template: Mesh, part: int | str, poses: np.nd
         lengths = [border_between(template, halved, other, half)[1].sum() for half in (p, P)]
         return p if lengths[0] >= lengths[1] else P
 
+    # which half stays: the one at the parent, in the root the larger one
     areas = [template.face_areas[halved == half].sum() for half in (p, P)]
     stays = nearer(int(skeleton.parents[p])) if p else (0 if areas[0] >= areas[1] else P)
-    if stays == P:                                                      # the half that keeps its number is p
+    if stays == P:                                                      # swap: the half that stays is p
         halved = np.where(label == p, np.where(cut, p, P), label)
-    place = np.r_[np.arange(p + 1), np.arange(p + 2, P + 1), p + 1]     # old number -> new, the new half after p
+    place = np.r_[np.arange(p + 1), np.arange(p + 2, P + 1), p + 1]     # old number -> new; the new half follows p
     parents = np.full(P + 1, -1)
     for j in range(1, P):
         parents[place[j]] = place[nearer(j) if skeleton.parents[j] == p else skeleton.parents[j]]
     parents[p + 1] = p
     joints = np.empty((P + 1, 3))
     joints[place] = np.r_[skeleton.joints, np.zeros((1, 3))]
+    # names: the given ones, else the old one and the first free number behind it
     name = skeleton.names[p]
     free = next(new for k in range(2, P + 3) if (new := f"{name}_{k}") not in skeleton.names)
     chosen = (name, free) if names is None else tuple(names)
@@ -136,12 +154,12 @@ def split_part(skeleton: Skeleton, template: Mesh, part: int | str, poses: np.nd
 
 
 def rename_part(skeleton: Skeleton, part: int | str, name: str) -> Skeleton:
-    """The skeleton with another name for one part.
+    """Rename one part.
 
     Raises
     ------
     ValueError
-        A part that is not there, or a name that is empty, a number, or taken.
+        An unknown part, or a name that is empty, a number, or taken.
     """
     p = find_part_number(skeleton, part)
     if not isinstance(name, str) or not name.strip() or name.isdecimal():
@@ -153,21 +171,29 @@ def rename_part(skeleton: Skeleton, part: int | str, name: str) -> Skeleton:
 
 def move_joint(skeleton: Skeleton, template: Mesh, part: int | str, position: Sequence[float] | None = None,
                ring: Sequence[int] | None = None) -> Skeleton:
-    """The skeleton with the joint between a part and its parent elsewhere.
+    """Move the joint between a part and its parent.
 
     Parameters
     ----------
     skeleton : Skeleton
+        The skeleton to edit.
     template : Mesh
-    part : name or number
-    position : (3,) float, metres, on the template
-    ring : (n,) int
-        Instead of a position: vertices of the template, in whose middle the joint is put.
+        Its template.
+    part : str or int
+        Name or number of the part.
+    position : (3,) float, metres, optional
+        New position on the template.
+    ring : (n,) int, optional
+        Instead of a position: vertices of the template, at whose centre the joint is placed.
+
+    Returns
+    -------
+    Skeleton
 
     Raises
     ------
     ValueError
-        The root, which has no joint; not one of `position` and `ring`; numbers that are no position or no vertices.
+        The root, which has no joint; both or none of `position` and `ring`; an invalid position or vertex.
     """
     p = find_part_number(skeleton, part)
     if p == 0:
@@ -192,20 +218,27 @@ def move_joint(skeleton: Skeleton, template: Mesh, part: int | str, position: Se
 
 def apply_edits(skeleton: Skeleton, template: Mesh, edits: Sequence[dict[str, Any]],
                 poses: np.ndarray | None = None) -> Skeleton:
-    """Carry out a list of edits, as it stands in a file (see the head of this module).
+    """Apply a list of edits in order (see the head of this module).
 
     Parameters
     ----------
     skeleton : Skeleton
+        The skeleton to edit.
     template : Mesh
+        Its template.
     edits : list of dict
+        The edits, as a file holds them.
     poses : (M, N, 3) float, metres, optional
-        A split is made where the part bends most in them.
+        Poses in which a split part bends most at the cut.
+
+    Returns
+    -------
+    Skeleton
 
     Raises
     ------
     ValueError
-        An entry that cannot be read or carried out, named by its number from 1 and its words.
+        An entry that cannot be read or applied, named by its number from 1 and its text.
     """
     if len(skeleton.part_of_face) != len(template.faces):
         raise ValueError(f"template: expected the {len(skeleton.part_of_face)} triangles of the skeleton, "
@@ -219,7 +252,7 @@ def apply_edits(skeleton: Skeleton, template: Mesh, edits: Sequence[dict[str, An
 
 
 def read_edits(path: str | Path) -> list[dict[str, Any]]:
-    """The edits of a JSON file; StorageError where it is missing or holds no list."""
+    """Read the edits of a JSON file; StorageError where it is missing or holds no list."""
     stored = storage.read_json(path, "a list of edits")
     if not isinstance(stored, list):
         raise storage.StorageError(f"{path}: expected a list of edits in JSON, found something else")
@@ -227,7 +260,8 @@ def read_edits(path: str | Path) -> list[dict[str, Any]]:
 
 
 def _apply(skeleton: Skeleton, template: Mesh, edit: dict[str, Any], poses: np.ndarray | None) -> Skeleton:
-    """The skeleton after one entry of a list of edits."""
+    """Apply one entry of a list of edits."""
+    # every action with the extra keys that it takes
     known = {"merge": set(), "split": {"names"}, "rename": set(), "move_joint": {"position", "ring"}}
     if not isinstance(edit, dict):
         raise ValueError(f"expected an object with one of {', '.join(known)}")
@@ -239,6 +273,7 @@ def _apply(skeleton: Skeleton, template: Mesh, edit: dict[str, Any], poses: np.n
     unknown = set(edit) - known[action] - {action}
     if unknown:
         raise ValueError(f"{action} does not know {', '.join(sorted(unknown))}")
+    # carry out the action; rename takes several parts at once
     if action == "merge":
         if not isinstance(what, list) or len(what) != 2:
             raise ValueError(f"merge: expected a list of two parts, got {what!r}")
@@ -255,23 +290,24 @@ def _apply(skeleton: Skeleton, template: Mesh, edit: dict[str, Any], poses: np.n
 
 
 def border_between(template: Mesh, label: np.ndarray, a: int, b: int) -> tuple[np.ndarray, np.ndarray]:
-    """The edges (n, 2) that part a shares with part b, as vertices, and their lengths (n,), metres."""
+    """Find the edges (n, 2) between parts a and b, as vertices, and their lengths (n,), metres."""
     shared = template.edge_use == 2
     both = np.sort(label[template.face_pairs], axis=1)
     border = (both == [min(a, b), max(a, b)]).all(axis=1)
     return template.edges[shared][border], template.edge_lengths[shared][border]
 
 
-def cut_across(template: Mesh, mine: np.ndarray, joints: np.ndarray) -> np.ndarray | None:
-    """Which triangles (F,) bool of a part `mine` (F,) bool to cut off: the farther half along its length.
+def cut_across(template: Mesh, inside_part: np.ndarray, joints: np.ndarray) -> np.ndarray | None:
+    """Find the triangles (F,) bool to cut off a part (F,) bool: the farther half along its length.
 
-    Its length runs along its joints (n, 3), of one joint from there to the middle, of none along its main axis. None
-    where no cut leaves two connected halves.
+    The length runs along its joints (n, 3). With one joint it runs from there to the centroid, with none along the main
+    axis. Returns None where no cut leaves two connected halves.
     """
-    inside = np.flatnonzero(mine)
-    pairs = np.searchsorted(inside, template.face_pairs[mine[template.face_pairs].all(axis=1)])
+    inside = np.flatnonzero(inside_part)
+    pairs = np.searchsorted(inside, template.face_pairs[inside_part[template.face_pairs].all(axis=1)])
     areas, centres = template.face_areas[inside], template.corners.mean(axis=1)[inside]
     middle = areas @ centres / areas.sum()
+    # axes to try: along the joints first, then the principal axes, longest first
     axes = np.linalg.eigh(np.cov(centres.T, aweights=areas))[1].T[::-1]
     if len(joints):
         axes = np.vstack([np.linalg.svd(joints - joints.mean(axis=0))[2][0] if len(joints) > 1
@@ -280,23 +316,23 @@ def cut_across(template: Mesh, mine: np.ndarray, joints: np.ndarray) -> np.ndarr
         far = ((centres - middle) @ axis > 0).astype(np.int64)
         if not 0 < far.sum() < len(far):
             continue
-        far = keep_connected(np.zeros((len(far), 2)), pairs, areas, far)      # what lies apart there goes back
+        far = keep_connected(np.zeros((len(far), 2)), pairs, areas, far)  # detached pieces go back
         if label_patches(pairs, far).max() == 1:
-            cut = np.zeros_like(mine)
+            cut = np.zeros_like(inside_part)
             cut[inside[far == 1]] = True
             return cut
     return None
 
 
-def cut_where_it_bends(template: Mesh, poses: np.ndarray, mine: np.ndarray) -> np.ndarray | None:
-    """Which triangles (F,) bool of a part (F,) bool to cut off so that the halves move most rigidly; None if none."""
+def cut_where_it_bends(template: Mesh, poses: np.ndarray, inside_part: np.ndarray) -> np.ndarray | None:
+    """Find the triangles (F,) bool to cut off a part (F,) bool so that both halves move rigidly; None if impossible."""
     search = PartSearch(PosedSurface(template, poses), SkeletonConfig())
-    halved, apart = search.split(np.where(mine, 0, 1), 0)
+    halved, apart = search.split(np.where(inside_part, 0, 1), 0)
     return halved == halved.max() if apart > 0 else None
 
 
 def _joint_between(template: Mesh, label: np.ndarray, a: int, b: int, poses: np.ndarray | None) -> np.ndarray:
-    """The joint (3,) of two parts: by the poses where there are some, else the middle of the border."""
+    """Place the joint (3,) between two parts: by the poses if given, else at the centre of the border."""
     if poses is None:
         return ring_centre(template, np.unique(border_between(template, label, a, b)[0]))
     surface = PosedSurface(template, poses)

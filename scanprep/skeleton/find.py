@@ -1,4 +1,4 @@
-"""The skeleton of a body from its registered poses, and how it was found."""
+"""Find the skeleton of a body from its registered poses."""
 from __future__ import annotations
 
 from collections.abc import Callable
@@ -20,52 +20,65 @@ __all__ = ["SkeletonConfig", "find_skeleton", "search_skeleton"]
 
 @dataclass(frozen=True)
 class OpenedLoop:
-    """A loop of parts that had to be opened for a tree."""
+    """A loop of linked parts that was opened to get a tree."""
 
-    parts: tuple[str, str]  # those that lie where it was opened; twice the same when they became one
-    joined: bool  # whether they became one; else only the link between them was dropped
+    parts: tuple[str, str]  # the two parts where it was opened; twice the same if they were merged
+    joined: bool  # whether they were merged; else only their link was dropped
     length: int  # number of links that lay on loops
 
 
 @dataclass(frozen=True, eq=False)
 class SkeletonSearch:
-    """A skeleton and how it was found."""
+    """A skeleton with the facts of its search."""
 
     skeleton: Skeleton
     loops: tuple[OpenedLoop, ...]
     symmetry: Symmetry               # the best mirror symmetry of the body, whether it holds or not
-    symmetric: bool                  # left and right have the same parts by construction, only borders may differ
+    symmetric: bool                  # left and right have the same parts by construction; borders may differ
     energies: tuple[float, ...]      # of every restart, as a share of the squared size of the body
     parts: tuple[int, ...]           # number of parts that every restart ended with
 
 
 def find_skeleton(template: Mesh, poses: np.ndarray, config: SkeletonConfig | None = None,
                   progress: Callable[[int, int], None] | None = None, step: Step = run_uncached) -> Skeleton:
-    """Rigid parts, the tree over them, and the joints, from registered poses of one body.
+    """Find rigid parts, the tree over them, and the joints, from registered poses of one body.
 
-    Parts that never move against each other in the poses cannot be told apart. Of a symmetric body left and right
-    get the same parts. `search_skeleton` tells more of how they were found.
+    Parts that never move against each other in the poses cannot be separated. A symmetric body gets the same parts left
+    and right. `search_skeleton` also returns the facts of the search.
 
     Parameters
     ----------
     template : Mesh
+        One connected manifold component.
     poses : (M, N, 3) float, metres
         The template's vertices in at least three poses.
     config : SkeletonConfig, optional
-    progress : callable(done, total), optional
+        Settings.
+    progress : callable, optional
+        Called as progress(done, total).
     step : callable, optional
-        Keeps what was found on the way, as `scanprep.batch.room.Step`.
+        Caches intermediate results, as `scanprep.batch.room.Step`.
 
     Returns
     -------
     Skeleton
-        Part 0 lies in the middle of the body.
+        Part 0, the root, is the part nearest to the rest of the body.
 
     Raises
     ------
     ValueError
-        A template that is not one connected manifold; poses of another shape, not finite, or too few; no tree of as
-        many parts as asked for; a symmetric skeleton asked for where no part has a mirror image.
+        A template that is not one connected manifold; poses of another shape, not finite, or fewer than three; no tree
+        with the requested number of parts; a symmetric skeleton requested of a body without two sides.
+
+    Examples
+    --------
+    >>> z, turn = np.meshgrid(np.linspace(-1, 1, 21), np.arange(12) * np.pi / 6, indexing="ij")      # a tube
+    >>> x = np.stack([0.2 * np.cos(turn), 0.2 * np.sin(turn), z], axis=-1).reshape(-1, 3)
+    >>> a, b = np.arange(252).reshape(21, 12), np.roll(np.arange(252).reshape(21, 12), -1, axis=1)
+    >>> faces = np.stack([a[:-1], b[:-1], b[1:], a[:-1], b[1:], a[1:]], axis=-1).reshape(-1, 3)
+    >>> bend = [[np.r_[p[0], p[1] - k * max(p[2], 0), p[2] - 0.3 * k * max(p[2], 0)] for p in x] for k in (0, 0.3, 0.6)]
+    >>> find_skeleton(Mesh(x, faces), np.array(bend), SkeletonConfig(parts=2, restarts=1)).joints.shape
+    (2, 3)
 
     [SCAPE] §3
     """
@@ -75,32 +88,33 @@ def find_skeleton(template: Mesh, poses: np.ndarray, config: SkeletonConfig | No
 @one_thread()
 def search_skeleton(template: Mesh, poses: np.ndarray, config: SkeletonConfig | None = None,
                     progress: Callable[[int, int], None] | None = None, step: Step = run_uncached) -> SkeletonSearch:
-    """The skeleton of `find_skeleton`, with the loops, the symmetry and the restarts it came from.
+    """Find a skeleton as `find_skeleton` does, and return it with its loops, symmetry and restarts.
 
-    Arguments and errors are those of `find_skeleton`; `step` keeps every restart.
+    Arguments and errors are those of `find_skeleton`; `step` caches every restart.
 
     [Articulated]
     """
     config = config or SkeletonConfig()
     finder = SkeletonFinder(template, poses, config, progress, step)
+    # the restart with the best score; its tree is adapted to the requested number of parts
     best = finder.runs[0]
     skeleton, symmetric = finder.skeleton(best, config.parts)
     loops = tuple(_name_loop(loop, skeleton) for loop in best.loops)
-    found = SkeletonSearch(skeleton, loops, finder.symmetry, symmetric,
+    search = SkeletonSearch(skeleton, loops, finder.symmetry, symmetric,
                            tuple(run.energy for run in finder.runs), tuple(len(run.links) + 1 for run in finder.runs))
     if progress is not None:
         progress(config.restarts + 1, config.restarts + 1)
-    return found
+    return search
 
 
 def skeleton_problem(found: SkeletonSearch, wanted: int | None) -> str | None:
-    """Why a skeleton means nothing, with the likely cause; None where it does, also where `wanted` is one part."""
+    """Explain why a skeleton is meaningless, with the likely cause; None where it is not, or one part was requested."""
     if len(found.skeleton.parents) > 1 or wanted == 1:
         return None
     return "the body has one part and no joint; the meshes do not differ in pose, or are smaller than their unit says?"
 
 
 def _name_loop(loop: Loop, skeleton: Skeleton) -> OpenedLoop:
-    """A loop with the names of the parts that hold most of its two sides."""
+    """Describe a loop by the parts of the skeleton that hold most of its two sides."""
     a, b = (skeleton.names[int(np.bincount(skeleton.part_of_face[side]).argmax())] for side in loop.sides)
     return OpenedLoop((a, b), loop.joined, loop.length)

@@ -1,6 +1,6 @@
-"""From rigid parts to a tree with a joint on every link.
+"""Turn rigid parts into a tree with a joint on every link.
 
-Parts that are mere passages between two others dissolve, loops are opened, and every link gets its joint.
+Parts that only blend between two neighbours are dissolved, loops are opened, and every link gets its joint.
 """
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ from .motions import Motions, PosedSurface
 from .parts import FADING, PartSearch
 from .sides import mirror_pairs, reductions
 
-LOOP_SEPARATION = 1.5            # times the separation of parts: on a loop, closer ones are merged
+LOOP_SEPARATION = 1.5            # in a loop, parts less than this times the separation apart are merged
 
 
 def border_lengths(search: PartSearch, label: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Pairs of parts that touch (n, 2) and the length of their common border (n,), metres."""
+    """Find pairs of parts that touch (n, 2), and the length of their common border (n,), metres."""
     s = search.surface
     both = np.sort(label[s.pairs], axis=1)
     differ = both[:, 0] != both[:, 1]
@@ -29,24 +29,26 @@ def border_lengths(search: PartSearch, label: np.ndarray) -> tuple[np.ndarray, n
 
 
 def is_connected(links: np.ndarray, count: int) -> bool:
-    """Whether links (n, 2) join all of `count` parts."""
+    """Test whether links (n, 2) connect all `count` parts."""
     return not label_components(links[:, 0], links[:, 1], count).any()
 
 
 def without_weak(search: PartSearch, label: np.ndarray) -> np.ndarray:
-    """The links (n, 2) without contacts that are short beside the other borders of both parts.
+    """Return the links (n, 2) between touching parts, without contacts that are short against their other borders.
 
-    A contact that alone holds parts together stays.
+    A contact that is the only connection stays.
     """
     pairs, lengths = border_lengths(search, label)
     count = int(label.max()) + 1
     image = mirror_pairs(pairs, search.sides.partners(label))
+    # a border and its mirror image count alike
     lengths = (lengths + lengths[image]) / 2
     longest = np.zeros(count)
     for side in range(2):
         np.maximum.at(longest, pairs[:, side], lengths)
-    weak = lengths < 0.2 * longest[pairs].min(axis=1)                # thighs that touch are not linked
+    weak = lengths < 0.2 * longest[pairs].min(axis=1)                # a fifth: thighs that touch are not linked
     keep = np.ones(len(pairs), dtype=bool)
+    # drop weak contacts, shortest first, unless that disconnects the parts
     for i in np.argsort(lengths, kind="stable"):
         if weak[i] and keep[i]:
             keep[[i, image[i]]] = False
@@ -56,11 +58,11 @@ def without_weak(search: PartSearch, label: np.ndarray) -> np.ndarray:
 
 
 def dissolve_bands(search: PartSearch, label: np.ndarray) -> np.ndarray:
-    """Labels (F,) without the parts that are only the passage between two neighbours.
+    """Dissolve parts that only blend between two neighbours; return the labels (F,).
 
-    The skin of a shoulder or a knee moves in between; cut out, such a band looks like a part. It is none if a blend of
-    its neighbours' motions, vertex by vertex, explains nearly all that its own motion explains. A band stays if the
-    labels that follow are no fewer.
+    Skin at a shoulder or knee moves in between its neighbours, and such a band looks like a part. It is none if a blend
+    of its neighbours' motions, vertex by vertex, explains nearly all that its own motion explains. A band stays if
+    dissolving it does not reduce the number of labels.
     """
     while True:
         explained, between = passages(search, label)
@@ -76,20 +78,21 @@ def dissolve_bands(search: PartSearch, label: np.ndarray) -> np.ndarray:
 
 
 def passages(search: PartSearch, label: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """How far each part is a passage between neighbours (P,), 1 when entirely, and between which two (P, 2).
+    """Measure how far each part is a blend between two neighbours (P,), at most 1, and which two (P, 2).
 
-    The share of what is lost when the part's vertices follow the neighbour they fit best that a blend of two
-    neighbours wins back.
+    Without the part, its vertices follow their best neighbour, and the residual grows. The measure is the share of that
+    growth that a blend of two neighbours recovers.
     """
     s, motions = search.surface, search.motions(label)
     partner = search.sides.partners(label)
     P, contacts = int(label.max()) + 1, search.contacts(label)
     lost, won, between = np.ones(P), np.full(P, -np.inf), np.zeros((P, 2), dtype=np.int64)
     for p in range(P):
-        mine = label == p
-        vertices, place = np.unique(s.mesh.faces[mine], return_inverse=True)
-        weights = np.bincount(place.ravel(), np.repeat(s.face_weights[mine] / 3, 3))
+        inside = label == p
+        vertices, place = np.unique(s.mesh.faces[inside], return_inverse=True)
+        weights = np.bincount(place.ravel(), np.repeat(s.face_weights[inside] / 3, 3))
         near = np.setdiff1d(contacts[(contacts == p).any(axis=1)], p)
+        # residual of the part's own motion, of its best neighbour per vertex, and of the best blend of two neighbours
         own = weights @ _squares(_gaps(search, motions, p, vertices))
         gaps = [_gaps(search, motions, int(q), vertices) for q in near]
         if not len(near):
@@ -106,25 +109,25 @@ def passages(search: PartSearch, label: np.ndarray) -> tuple[np.ndarray, np.ndar
 
 
 def _gaps(search: PartSearch, motions: Motions, part: int, vertices: np.ndarray) -> np.ndarray:
-    """(n, M, 3) from the vertices in the poses to where the motion of a part would carry them, metres."""
+    """Return the residuals (n, M, 3), metres, of vertices in all poses under the motion of a part."""
     s = search.surface
     return np.einsum("mij,nj->nmi", motions.R[part], s.x[vertices]) + motions.t[part] - s.y[vertices]
 
 
 def _squares(gap: np.ndarray) -> np.ndarray:
-    """(n,) squared lengths, mean over the poses."""
+    """Return mean squared lengths (n,) over the poses."""
     return (gap**2).sum(axis=(1, 2)) / gap.shape[1]
 
 
 def _blend(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """(n,) the least squares that a blend of two motions leaves of their gaps, its share free for every vertex."""
+    """Return the mean squared residual (n,) of the best blend of two motions, with a free share for every vertex."""
     apart = a - b
     share = np.clip(-(apart * b).sum(axis=(1, 2)) / np.maximum((apart**2).sum(axis=(1, 2)), 1e-300), 0, 1)
     return _squares(b + share[:, None, None] * apart)
 
 
 def _share_out(search: PartSearch, label: np.ndarray, band: int, between: np.ndarray) -> np.ndarray:
-    """Labels where every triangle of a band, and of its mirror image, goes to the neighbour that it follows better."""
+    """Give every triangle of a band, and of its mirror image, to the neighbour that it follows better."""
     partner = search.sides.partners(label)
     costs = search.surface.face_costs(search.motions(label))
     for part, pair in ((band, between), (partner[band], partner[between])):
@@ -136,18 +139,18 @@ def _share_out(search: PartSearch, label: np.ndarray, band: int, between: np.nda
 class Loop:
     """A loop of parts that was opened."""
 
-    sides: tuple[np.ndarray, np.ndarray]  # two (F,) bool: the triangles of the two parts where it was opened, before
-    joined: bool  # whether the two became one; else only the link between them was dropped
+    sides: tuple[np.ndarray, np.ndarray]  # two (F,) bool: the triangles of the two parts where it was opened
+    joined: bool  # whether the two were merged; else only their link was dropped
     length: int  # number of links that lay on loops
 
 
 def to_tree(search: PartSearch, label: np.ndarray) -> tuple[np.ndarray, np.ndarray, list[Loop]]:
     """Merge parts, and drop links, until parts and links form a tree.
 
-    On a loop, the two parts whose union costs least become one unless they are well apart: this joined the
-    halves of crotch and chest in the paper, by hand. Where all parts of a loop move freely, the link whose
-    parts move most against each other is dropped: thighs that touch under the crotch. On a symmetric body both
-    happen on both sides, so that the tree is symmetric too. Returns labels (F,), links (P - 1, 2) and loops opened.
+    In a loop, the two parts whose union costs least are merged unless they are well separated. The paper did this by
+    hand with the halves of crotch and chest. If all parts of a loop move freely, the link with the largest relative
+    motion is dropped, such as that of thighs that touch. On a symmetric body both sides are treated alike. Returns
+    labels (F,), links (P - 1, 2) and the opened loops.
 
     [SCAPE] §3
     """
@@ -158,10 +161,12 @@ def to_tree(search: PartSearch, label: np.ndarray) -> tuple[np.ndarray, np.ndarr
         pairs, separation, extra = search.separations(label)
         of_pair = {tuple(pair): i for i, pair in enumerate(pairs.tolist())}
         while len(links) > count - 1:
+            # links in loops: those whose removal keeps the parts connected
             each = np.arange(len(links))
             loop = [i for i in each if is_connected(links[each != i], count)]
             number = np.array([of_pair[tuple(links[i].tolist())] for i in loop])
             image = mirror_pairs(links, search.sides.partners(label))
+            # merge the cheapest pair if it is not well separated, or if no link can be dropped with its mirror image
             cheapest = number[extra[number].argmin()]
             sound = [k for k in np.argsort(-extra[number], kind="stable")
                      if is_connected(np.delete(links, [loop[k], image[loop[k]]], axis=0), count)]
@@ -177,22 +182,22 @@ def to_tree(search: PartSearch, label: np.ndarray) -> tuple[np.ndarray, np.ndarr
             return label, links, loops
         joined = search.join(label, *pairs[cheapest])
         label = search.alternate(joined, rounds=4)
-        if label.max() + 1 >= count:                             # cut again by the alternation
+        if label.max() + 1 >= count:                             # the alternation split them again
             label = np.unique(joined, return_inverse=True)[1]
 
 
 def tree_of(search: PartSearch, label: np.ndarray, links: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """From a tree of parts one of exactly `count`: linked parts joined, or the parts cut that bend most."""
+    """Reach a tree of exactly `count` parts, by merging linked parts or cutting the parts that bend most."""
     while len(links) + 1 != count:
-        found = (fewer_parts if len(links) + 1 > count else more_parts)(search, label, count)
-        if found is None:
+        tree = (fewer_parts if len(links) + 1 > count else more_parts)(search, label, count)
+        if tree is None:
             raise ValueError(f"parts: no tree of {count} parts was found, only one of {len(links) + 1}")
-        label, links = found
+        label, links = tree
     return label, links
 
 
 def more_parts(search: PartSearch, label: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray] | None:
-    """The tree where the part that bends most is cut; it may have one part too many if two of them can be joined."""
+    """Cut the part that bends most; the tree may have one part too many if two of them can be merged."""
     cuts = sorted((search.split(label, p) for p in range(int(label.max()) + 1)), key=lambda cut: -cut[1])
     for cut, apart in cuts:
         many = int(cut.max()) + 1
@@ -204,9 +209,9 @@ def more_parts(search: PartSearch, label: np.ndarray, count: int) -> tuple[np.nd
 
 def fewer_parts(search: PartSearch, label: np.ndarray, count: int, limit: float = np.inf
                 ) -> tuple[np.ndarray, np.ndarray] | None:
-    """The tree where the two linked parts are one whose union costs least, with not less than `count` parts.
+    """Merge the two linked parts whose union costs least, keeping at least `count` parts.
 
-    Parts farther apart than `limit` stay.
+    Parts with a separation above `limit` stay.
     """
     many, partner = int(label.max()) + 1, search.sides.partners(label)
     pairs, separation, extra = search.separations(label)
@@ -221,10 +226,10 @@ def fewer_parts(search: PartSearch, label: np.ndarray, count: int, limit: float 
 
 
 def place_joints(surface: PosedSurface, label: np.ndarray, motions: Motions, links: np.ndarray) -> np.ndarray:
-    """Points (n, 3), metres on the template, that both parts of a link (n, 2) carry to one place in every pose.
+    """Place joints (n, 3), metres on the template: points that both parts of a link (n, 2) carry to one place.
 
-    Least squares over the poses. Along the axis of a hinge, and where the parts hardly rotate, any point will
-    do: there the joint is drawn to the centroid of the border.
+    Least squares over the poses [Articulated]. Along the axis of a hinge, and where the parts hardly rotate, any point
+    fits. There the joint is pulled to the centroid of the border.
     """
     s = surface
     edge = s.mesh.edges[s.mesh.edge_use == 2]
@@ -233,6 +238,7 @@ def place_joints(surface: PosedSurface, label: np.ndarray, motions: Motions, lin
     joints = np.empty((len(links), 3))
     for n, (a, b) in enumerate(links):
         border = (both == [min(a, b), max(a, b)]).all(axis=1)
+        # centroid and radius of the border, weighted by edge lengths
         ring = np.average(middle[border], axis=0, weights=s.pair_lengths[border])
         radius = np.sqrt(np.average(((middle[border] - ring)**2).sum(axis=1), weights=s.pair_lengths[border]))
         dR = motions.R[a] - motions.R[b]
@@ -241,14 +247,14 @@ def place_joints(surface: PosedSurface, label: np.ndarray, motions: Motions, lin
 
 
 def _meeting_point(dR: np.ndarray, gap: np.ndarray, radius: float) -> np.ndarray:
-    """The c (3,) that makes `dR c + gap` (M, 3) small, drawn to 0 where the poses do not determine it.
+    """Find the c (3,) that minimises `dR c + gap` (M, 3), pulled to 0 where the poses do not determine it.
 
-    The pull is that of a prior of a few times `radius` beside the error that no c removes.
+    The pull is a Gaussian prior of width 0.6 `radius`, weighed by the residual that remains.
     """
     A = np.einsum("mki,mkj->ij", dR, dR) / len(dR)
     b = np.einsum("mki,mk->i", dR, gap) / len(dR)
-    pull = least = 1e-4                          # squared radians: rotations below 0.01 say nothing about a joint
-    expected = 0.6 * radius                      # from the border's centroid
+    pull = least = 1e-4                          # squared radians: rotations below 0.01 do not locate a joint
+    expected = 0.6 * radius                      # usual distance of a joint from the border's centroid
     for _ in range(2):
         c = -np.linalg.solve(A + pull * np.eye(3), b)
         pull = max(least, float(((dR @ c + gap)**2).sum(axis=1).mean()) / expected**2)
@@ -256,7 +262,7 @@ def _meeting_point(dR: np.ndarray, gap: np.ndarray, radius: float) -> np.ndarray
 
 
 def ring_centre(template: Mesh, ring: np.ndarray) -> np.ndarray:
-    """The middle (3,) of a ring of vertices, metres: each counts for its share of the length around."""
+    """Return the centre (3,) of a ring of vertices, metres, weighted by the length of its edges."""
     inside = np.isin(template.edges, ring).all(axis=1)
     if not inside.any():
         return template.vertices[ring].mean(axis=0)
@@ -265,7 +271,7 @@ def ring_centre(template: Mesh, ring: np.ndarray) -> np.ndarray:
 
 
 def middle_part(areas: np.ndarray, centres: np.ndarray, links: np.ndarray, joints: np.ndarray) -> int:
-    """The part nearest to the rest of the body, by paths through the joints, weighted by areas (P,)."""
+    """Find the part nearest to the rest of the body, by path lengths through the joints, weighted by areas (P,)."""
     P = len(areas)
     if P == 1:
         return 0

@@ -1,8 +1,8 @@
 """Rigid motions of sets of vertices over all poses, from sums that add up when sets are joined.
 
-For a set of vertices with weights the best rotation, translation and residual of every pose depend only on a
-few sums over the set. Joining two sets adds their sums, so the cost of a union is found without touching
-the vertices again. Sets are joined greedily, the cheapest union first.
+For a weighted set of vertices the best rotation, translation and residual of every pose depend only on a few sums over
+the set. The sums of a union are the sums of both sets, so its cost is found without touching the vertices again. Sets
+are joined greedily, the cheapest union first.
 """
 from __future__ import annotations
 
@@ -19,27 +19,27 @@ from ..geometry.mesh import Mesh
 class Moments:
     """Weighted sums over P sets of vertices, in M poses."""
 
-    w: np.ndarray  # (P,) float: σ w
-    x: np.ndarray  # (P, 3) float: σ w x, x on the template
-    y: np.ndarray  # (P, M, 3) float: σ w y, y in the pose
-    yx: np.ndarray  # (P, M, 3, 3) float: σ w y xᵀ
-    xx: np.ndarray  # (P,) float: σ w |x|² and Σ w |y|² over all poses
-    yy: np.ndarray  # (P,) float: σ w |x|² and Σ w |y|² over all poses
+    w: np.ndarray  # (P,) float: Σ w
+    x: np.ndarray  # (P, 3) float: Σ w x, x on the template
+    y: np.ndarray  # (P, M, 3) float: Σ w y, y in the pose
+    yx: np.ndarray  # (P, M, 3, 3) float: Σ w y xᵀ
+    xx: np.ndarray  # (P,) float: Σ w |x|²
+    yy: np.ndarray  # (P,) float: Σ w |y|² over all poses
 
     def each(self) -> tuple[np.ndarray, ...]:
-        """All sums, arrays of P rows."""
+        """Return all sums, arrays of P rows."""
         return self.w, self.x, self.y, self.yx, self.xx, self.yy
 
     def __getitem__(self, sets: np.ndarray | slice) -> Moments:
-        """The sums of some of the sets."""
+        """Return the sums of some of the sets."""
         return Moments(*(a[sets] for a in self.each()))
 
     def __add__(self, other: Moments) -> Moments:
-        """The sums of the unions, set by set."""
+        """Return the sums of the unions, set by set."""
         return Moments(*(a + b for a, b in zip(self.each(), other.each(), strict=True)))
 
     def gather(self, label: np.ndarray) -> Moments:
-        """The sums over the sets (P,) of each label."""
+        """Add the sums of all sets (P,) with the same label."""
         into = csr_array((np.ones(len(label)), (label, np.arange(len(label)))))
         return Moments(*((into @ a.reshape(len(label), -1)).reshape(-1, *a.shape[1:]) for a in self.each()))
 
@@ -55,14 +55,15 @@ class Motions:
 
     R: np.ndarray  # (P, M, 3, 3) float
     t: np.ndarray  # (P, M, 3) float, metres: `y ≈ R x + t`, in the centred coordinates of `PosedSurface`
-    cost: np.ndarray  # (P,) float, square metres: σ w |R x + t - y|², mean over the poses
+    cost: np.ndarray  # (P,) float, square metres: Σ w |R x + t - y|², mean over the poses
 
 
 def fit_motions(moments: Moments) -> Motions:
-    """The rigid motion that carries each set best onto every pose (Procrustes), and what it leaves."""
+    """Fit the rigid motion of each set in every pose (Procrustes), and compute its residual."""
     m = moments
     cx, cy = m.x / m.w[:, None], m.y / m.w[:, None, None]
     H = m.yx - m.y[..., :, None] * cx[:, None, None, :]
+    # R from the SVD of the cross-covariance; a reflection is turned into the best rotation
     U, s, Vt = np.linalg.svd(H)
     proper = np.where(np.linalg.det(U) * np.linalg.det(Vt) < 0, -1.0, 1.0)
     U[..., :, 2] *= proper[..., None]
@@ -74,7 +75,7 @@ def fit_motions(moments: Moments) -> Motions:
 
 
 def rigid_costs(moments: Moments) -> np.ndarray:
-    """(P,) square metres: the costs of `fit_motions`, without the motions, several times faster."""
+    """Compute the costs (P,) of `fit_motions`, square metres, without the motions: several times faster."""
     m = moments
     cx, cy = m.x / m.w[:, None], m.y / m.w[:, None, None]
     H = m.yx - m.y[..., :, None] * cx[:, None, None, :]
@@ -83,11 +84,12 @@ def rigid_costs(moments: Moments) -> np.ndarray:
 
 
 def _best_trace(H: np.ndarray) -> np.ndarray:
-    """The largest trace(RᵀH) of all rotations R, for matrices (..., 3, 3).
+    """Compute the largest trace(RᵀH) over all rotations R, for matrices (..., 3, 3).
 
     It is e = s1 + s2 ± s3, the singular values with the sign of the determinant d. With a = Σ s² and b = Σ s²s² it is
     the largest root of (e² - a)² / 4 = b + 2 d e, which Newton's method reaches from above.
     """
+    # determinant d, a = Σ s² (sum of squares) and b = Σ s²s² (sum of 2 × 2 minors of HᵀH)
     c0, c1, c2 = H[..., 0], H[..., 1], H[..., 2]
     cross = np.stack([c0[..., 1] * c1[..., 2] - c0[..., 2] * c1[..., 1],
                       c0[..., 2] * c1[..., 0] - c0[..., 0] * c1[..., 2],
@@ -98,7 +100,7 @@ def _best_trace(H: np.ndarray) -> np.ndarray:
     a = n0 + n1 + n2
     b = np.maximum(n0 * n1 - d01**2, 0) + np.maximum(n1 * n2 - d12**2, 0) + np.maximum(n0 * n2 - d02**2, 0)
     e = np.sqrt(3 * a)
-    for _ in range(60):                              # few are needed unless the points of a set lie on a line
+    for _ in range(60):                              # a few suffice unless the points of a set lie on a line
         over = e * e - a
         slope = over * e - 2 * d
         step = (over * over / 4 - b - 2 * d * e) / np.where(slope > 0, slope, np.inf)
@@ -109,14 +111,14 @@ def _best_trace(H: np.ndarray) -> np.ndarray:
 
 
 def union_costs(moments: Moments, pairs: np.ndarray) -> np.ndarray:
-    """(n,) square metres: the cost of one rigid motion for both sets of each pair (n, 2)."""
+    """Compute the cost (n,), square metres, of one rigid motion for both sets of each pair (n, 2)."""
     return rigid_costs(moments[pairs[:, 0]] + moments[pairs[:, 1]])
 
 
 class PosedSurface:
     """A template and its poses (M, N, 3), centred and laid out for sums over vertices.
 
-    Vertices weigh as much as the area around them, the whole surface 1.
+    The weight of a vertex is its share of the surface area.
     """
 
     def __init__(self, template: Mesh, poses: np.ndarray) -> None:
@@ -133,49 +135,52 @@ class PosedSurface:
         self.pair_lengths = template.edge_lengths[template.edge_use == 2]
 
     def moments(self, label: np.ndarray, face_weights: np.ndarray | None = None) -> Moments:
-        """Sums over the triangles of every label; a third of a triangle's weight goes to each corner."""
+        """Compute the sums over the triangles of every label; each corner has a third of its triangle's weight."""
         weights = self.face_weights if face_weights is None else face_weights
         rows, columns = np.repeat(label, 3), self.mesh.faces.ravel()
         W = csr_array(coo_array((np.repeat(weights / 3, 3), (rows, columns)),
                                 shape=(label.max() + 1, len(self.x))))
         n, M = self.y.shape[:2]
         flat, x1 = self.y.reshape(n, -1), np.c_[self.x, np.ones(n)]
+        # Σ w y xᵀ and Σ w y in one product, as x has a fourth column of ones
         yx1 = np.empty((W.shape[0], 3 * M, 4))
         for p, (start, end) in enumerate(pairwise(W.indptr)):
-            mine = W.indices[start:end]
-            yx1[p] = flat[mine].T @ (W.data[start:end, None] * x1[mine])
+            corners = W.indices[start:end]
+            yx1[p] = flat[corners].T @ (W.data[start:end, None] * x1[corners])
         yx1 = yx1.reshape(-1, M, 3, 4)
         return Moments(np.asarray(W.sum(axis=1)).ravel(), W @ self.x, yx1[..., 3].copy(), yx1[..., :3].copy(),
                        W @ np.einsum("ni,ni->n", self.x, self.x), W @ self._yy)
 
     def core_motions(self, label: np.ndarray) -> Motions:
-        """Rigid motions (of parts (F,)) from the triangles that do not touch another part and move most rigidly.
+        """Fit rigid motions of parts (F,) to the triangles inside them, with robust weights.
 
-        At a border the surface follows both parts, and skin far from a bone slides over it: the waist with the thighs.
-        A part that has little else than border is fitted as a whole. Triangles count less the farther they are from
-        their part's motion, beside the median of the part (weights of Geman and McClure).
+        At a border the surface follows both parts, and skin far from a bone slides over it: the waist moves with the
+        thighs. A part that is mostly border is fitted as a whole. Weights are those of Geman-McClure, scaled by the
+        median residual of the part.
         """
         corner = self.mesh.faces
         low, high = np.full(len(self.x), label.max()), np.zeros(len(self.x), dtype=np.int64)
         for c in corner.T:
             np.minimum.at(low, c, label)
             np.maximum.at(high, c, label)
+        # core: triangles all of whose corners belong to one part only
         core = np.where((low == high)[corner].all(axis=1), self.face_weights, 0)
         share = np.bincount(label, core) / np.bincount(label, self.face_weights)
+        # with less than 0.3 of its area inside, the whole part is used
         core = np.where((share > 0.3)[label], core, self.face_weights)
         sets = [np.flatnonzero((label == p) & (core > 0)) for p in range(label.max() + 1)]
         motions = fit_motions(self.moments(label, core))
         for _ in range(3):
             off = self.face_costs(motions)[np.arange(len(label)), label] / self.face_weights
-            # residuals below 1e-5 of the square root of the area count as none
-            typical = np.array([np.median(off[mine]) for mine in sets]) + 1e-5**2 * self.area
+            # residuals below 1e-5 of the square root of the area are rounding
+            typical = np.array([np.median(off[inside]) for inside in sets]) + 1e-5**2 * self.area
             motions = fit_motions(self.moments(label, core / (1 + off / typical[label])**2))
         return motions
 
     def face_costs(self, motions: Motions) -> np.ndarray:
-        """(F, P) square metres: what each triangle would cost under each motion, mean over the poses.
+        """Compute the cost (F, P), square metres, of each triangle under each motion, mean over the poses.
 
-        The squares are multiplied out, so that the sum over the poses is one matrix product.
+        |A x - y|² is expanded, so that the sum over the poses is one matrix product.
         """
         P, M = motions.t.shape[:2]
         A = np.concatenate([motions.R, motions.t[..., None]], axis=-1)
@@ -190,9 +195,9 @@ class PosedSurface:
 
 
 def agglomerate(moments: Moments, contacts: np.ndarray, count: int, partner: np.ndarray | None = None) -> np.ndarray:
-    """The new number (P,) of every set after those that touch were joined, the cheapest union first, down to `count`.
+    """Join sets that touch, the cheapest union first, down to `count`; return the new number (P,) of every set.
 
-    A set and its `partner` (P,), the mirror image with which it is joined too, count as one.
+    A set and its mirror image, its `partner` (P,), are joined alike and count as one.
     """
     moments = moments[np.arange(len(moments.w))]
     cost = rigid_costs(moments)
@@ -210,13 +215,15 @@ def agglomerate(moments: Moments, contacts: np.ndarray, count: int, partner: np.
         a, b = int(partner[pair[0]]), int(partner[pair[1]])
         return union[pair] + union.get((min(a, b), max(a, b)), union[pair]) if tied else union[pair]
 
+    # keep the extra cost of every union of touching sets; take the cheapest, then update the unions it changed
     measure([(int(a), int(b)) for a, b in contacts])
-    left = int((partner >= owner).sum())
-    while left > count and union:
+    remaining = int((partner >= owner).sum())
+    while remaining > count and union:
         a, b = min(union, key=price)
         sets = closure(a, b, partner)
+        # join on both sides: moments, owners, costs and partners
         gone = {c for together in sets for c in together[1:]}
-        left -= len({min(c, int(partner[c])) for together in sets for c in together}) - 1
+        remaining -= len({min(c, int(partner[c])) for together in sets for c in together}) - 1
         for together in sets:
             for c in together[1:]:
                 moments.absorb(together[0], c)
@@ -224,6 +231,7 @@ def agglomerate(moments: Moments, contacts: np.ndarray, count: int, partner: np.
             cost[together[0]] = rigid_costs(moments[np.array(together[:1])])[0]
         for together, other in zip(sets, sets[::-1], strict=True):
             partner[together[0]] = other[0]
+        # unions with a joined set are measured anew
         kept = {together[0] for together in sets}
         touched = [pair for pair in union if not kept.isdisjoint(pair) or not gone.isdisjoint(pair)]
         for pair in touched:
@@ -234,16 +242,17 @@ def agglomerate(moments: Moments, contacts: np.ndarray, count: int, partner: np.
 
 
 def halve(moments: Moments, contacts: np.ndarray, group: np.ndarray) -> np.ndarray:
-    """What `agglomerate` down to two sets does, for many groups (P,) of sets side by side.
+    """Join the sets of many groups (P,) side by side, each down to two, as `agglomerate` does for one group.
 
-    Contacts (n, 2) are of sets of one group. Returns (P,) a set of those that became one; of every group two are left,
-    or as many pieces as it is in.
+    Contacts (n, 2) are between sets of the same group. Returns the surviving set (P,) of each set. Each group ends with
+    two sets, or with its number of disconnected pieces.
     """
     moments = moments[np.arange(len(moments.w))]
     cost, owner, pairs = rigid_costs(moments), np.arange(len(group)), contacts
     left = np.bincount(group)
     extra = union_costs(moments, pairs) - cost[pairs].sum(axis=1) if len(pairs) else np.zeros(0)
     while True:
+        # groups with more than two sets join their cheapest pair, all groups at once
         open_ = left[group[pairs[:, 0]]] > 2
         pairs, extra = pairs[open_], extra[open_]
         if not len(pairs):
@@ -258,6 +267,7 @@ def halve(moments: Moments, contacts: np.ndarray, group: np.ndarray) -> np.ndarr
         into = np.arange(len(group))
         into[gone] = kept
         owner = into[owner]
+        # unions with a joined set are measured anew
         touched = np.isin(pairs, np.r_[kept, gone]).any(axis=1)
         now = np.sort(into[pairs[touched]], axis=1)
         now = np.unique(now[now[:, 0] != now[:, 1]], axis=0)
@@ -266,6 +276,6 @@ def halve(moments: Moments, contacts: np.ndarray, group: np.ndarray) -> np.ndarr
 
 
 def closure(a: int, b: int, partner: np.ndarray) -> list[list[int]]:
-    """The sets of labels that become one each when a and b do: one set, or two that are mirror images."""
+    """Return the sets of labels that are merged when a and b are: one set, or two that are mirror images."""
     one, other = {int(a), int(b)}, {int(partner[a]), int(partner[b])}
     return [sorted(one | other)] if one & other else [sorted(one), sorted(other)]

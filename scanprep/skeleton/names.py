@@ -1,4 +1,4 @@
-"""Names for the parts of people, from the tree, its symmetry, and where the parts lie."""
+"""Name the parts of people from the tree, its symmetry, and the positions of the parts."""
 from __future__ import annotations
 
 from dataclasses import dataclass
@@ -12,13 +12,12 @@ from .tree import Skeleton
 
 
 def name_parts(template: Mesh, skeleton: Skeleton, symmetry: Symmetry) -> tuple[str, ...]:
-    """Names of the parts of a person: pelvis, abdomen, chest, head, upper_arm_left, ..., foot_right.
+    """Name the parts of a person: pelvis, abdomen, chest, head, upper_arm_left, ..., foot_right.
 
-    A body counts as a person if it is symmetric with a tree that is, the parts in the middle form one chain, one pair
-    of limbs hangs at its lower end and one further up, every limb is a chain, and the legs go on where the trunk ends,
-    as on somebody who stands. Beyond the arms the chain ends in a head; a head that was never seen to move is in the
-    chest. Left and right follow from the feet, whose soles are taken to reach forward from the ankles. Any other body
-    keeps the names it has.
+    A body counts as a person if it and its tree are symmetric, its middle parts form one chain, one pair of limbs
+    starts at the lower end and one further up, every limb is a chain, and the legs continue the trunk as in standing.
+    Beyond the arms the chain ends in a head. A head that never moves in the poses belongs to the chest. Left and right
+    follow from the feet: soles reach forward from the ankles. Any other body keeps its names.
     """
     person = _person(template, skeleton, symmetry) if symmetry.holds else None
     if person is None:
@@ -27,6 +26,7 @@ def name_parts(template: Mesh, skeleton: Skeleton, symmetry: Symmetry) -> tuple[
     if left is None:
         return skeleton.names
     names = dict(zip(person.spine, _spine_names(person), strict=True))
+    # limbs by their number of parts, from the body outwards
     arm = {1: ("arm",), 2: ("upper_arm", "forearm"), 3: ("upper_arm", "forearm", "hand")}
     leg = {1: ("leg",), 2: ("thigh", "shin"), 3: ("thigh", "shin", "foot")}
     for limbs, kinds, first in ((person.arms, arm, "shoulder"), (person.legs, leg, "hip")):
@@ -38,7 +38,7 @@ def name_parts(template: Mesh, skeleton: Skeleton, symmetry: Symmetry) -> tuple[
 
 
 def skeleton_doubts(skeleton: Skeleton) -> list[str]:
-    """What a person's skeleton lacks, as reasons of a judgement; none of a body that is no person."""
+    """List the joints that a person's skeleton lacks, as reasons of a judgement; none for other bodies."""
     missing = missing_joints(skeleton.names, skeleton.joints)
     return [f"the skeleton has no joint at the {', '.join(missing)}: add scans in which the body bends there"] \
         if missing else []
@@ -46,7 +46,7 @@ def skeleton_doubts(skeleton: Skeleton) -> list[str]:
 
 @dataclass(frozen=True, eq=False)
 class _Person:
-    """The chain in the middle, pelvis first, the limbs as chains of parts, the way up and the middle of the hips."""
+    """Trunk (from the pelvis) and limbs as chains of parts, the up direction and the centre of the hips."""
 
     spine: list[int]
     arms: list[list[int]]
@@ -58,7 +58,7 @@ class _Person:
 
 
 def part_partners(template: Mesh, skeleton: Skeleton, symmetry: Symmetry) -> np.ndarray | None:
-    """(J,) the part that holds most of each part's mirror image; None if that pairs no parts or breaks the tree."""
+    """Find the mirror partner (J,) of each part; None if the pairing is not mutual or does not preserve the tree."""
     J, part = len(skeleton.parents), skeleton.part_of_face
     table = np.zeros((J, J))
     np.add.at(table, (part, part[symmetry.partner]), template.face_areas)
@@ -69,7 +69,7 @@ def part_partners(template: Mesh, skeleton: Skeleton, symmetry: Symmetry) -> np.
 
 
 def _person(template: Mesh, skeleton: Skeleton, symmetry: Symmetry) -> _Person | None:
-    """What makes the body a person, None if it is none."""
+    """Analyse a body as a person; None if it is none."""
     partner = part_partners(template, skeleton, symmetry)
     if partner is None:
         return None
@@ -80,10 +80,11 @@ def _person(template: Mesh, skeleton: Skeleton, symmetry: Symmetry) -> _Person |
     if not found:
         return None
     spine, neck, order = found
+    # both pairs of limbs must be mirror images, and the legs must start at the lower end
     legs, arms = [limbs[i][1] for i in order[:2]], [limbs[i][1] for i in order[2:]]
     if {partner[legs[0][0]], partner[arms[0][0]]} != {legs[1][0], arms[1][0]} or limbs[order[0]][0] != spine[0]:
         return None
-    # the legs go on where the trunk ends, as on somebody who stands
+    # the legs continue the trunk, as in standing: within about 45 degrees
     hips = np.mean([_joint(skeleton, leg[0], spine[0]) for leg in legs], axis=0)
     up = (neck - hips) / np.linalg.norm(neck - hips)
     down = np.mean([_bones(template, skeleton, leg)[-1] for leg in legs], axis=0) - hips
@@ -93,7 +94,7 @@ def _person(template: Mesh, skeleton: Skeleton, symmetry: Symmetry) -> _Person |
 
 
 def _limbs(near: dict[int, list[int]], partner: np.ndarray, middle: list[int]) -> list[tuple[int, list[int]]]:
-    """The part in the middle and the chain that hangs on it, of four limbs; none of a body that has others."""
+    """Find the four limbs: for each its middle part and its chain of parts; empty for any other body."""
     limbs = [(p, chain) for p in middle for q in near[p] if partner[q] != q and (chain := _chain(near, p, q))]
     whole = len(middle) + sum(len(chain) for _, chain in limbs) == len(partner)
     forks = any(sum(partner[q] == q for q in near[p]) > 2 for p in middle)
@@ -102,20 +103,22 @@ def _limbs(near: dict[int, list[int]], partner: np.ndarray, middle: list[int]) -
 
 def _spine(template: Mesh, skeleton: Skeleton, along: dict[int, list[int]], limbs: list[tuple[int, list[int]]]
            ) -> tuple[list[int], np.ndarray, np.ndarray] | None:
-    """The chain in the middle from the legs to the head, the neck (3,), and the order of the limbs, legs first."""
+    """Find the chain from the legs to the head, the neck (3,), and the order of the limbs, legs first."""
     heads = [p for p in along if len(along[p]) < 2 and p not in {q for q, _ in limbs}]
     if len(heads) > 1:
         return None
     roots = np.array([_joint(skeleton, chain[0], p) for p, chain in limbs])
-    if heads:                                                             # legs are far from the neck
+    if heads:                                                             # legs are farther from the neck than arms
         spine = _chain(along, -1, heads[0])[::-1]
         neck = _joint(skeleton, spine[-1], spine[-2])
         return spine, neck, np.lexsort((-np.linalg.norm(roots - neck, axis=1), [spine.index(p) for p, _ in limbs]))
-    order = np.argsort([-_points(template, skeleton, chain)[1].sum() for _, chain in limbs])     # the heavier limbs
+    # without a head: legs are larger than arms
+    order = np.argsort([-_points(template, skeleton, chain)[1].sum() for _, chain in limbs])
     return _chain(along, -1, limbs[order[0]][0]), roots[order[2:]].mean(axis=0), order
 
 
 def _neighbours(skeleton: Skeleton) -> dict[int, list[int]]:
+    """List the linked parts of every part."""
     near: dict[int, list[int]] = {p: [] for p in range(len(skeleton.parents))}
     for child, parent in enumerate(skeleton.parents.tolist()):
         if parent >= 0:
@@ -125,7 +128,7 @@ def _neighbours(skeleton: Skeleton) -> dict[int, list[int]]:
 
 
 def _chain(near: dict[int, list[int]], before: int, first: int) -> list[int]:
-    """The parts from `first` on away from `before`; empty where they branch."""
+    """Follow the parts from `first` on, away from `before`; empty where they branch."""
     chain, last = [first], before
     while ahead := [q for q in near[chain[-1]] if q != last]:
         if len(ahead) > 1:
@@ -136,23 +139,24 @@ def _chain(near: dict[int, list[int]], before: int, first: int) -> list[int]:
 
 
 def _joint(skeleton: Skeleton, a: int, b: int) -> np.ndarray:
-    """The joint between two linked parts."""
+    """Return the joint (3,) between two linked parts."""
     return skeleton.joints[a if skeleton.parents[a] == b else b]
 
 
 def _points(template: Mesh, skeleton: Skeleton, parts: list[int]) -> tuple[np.ndarray, np.ndarray]:
-    """Centres (n, 3) and areas (n,) of the triangles of some parts."""
-    mine = np.isin(skeleton.part_of_face, parts)
-    return template.corners[mine].mean(axis=1), template.face_areas[mine]
+    """Return centroids (n, 3) and areas (n,) of the triangles of some parts."""
+    inside = np.isin(skeleton.part_of_face, parts)
+    return template.corners[inside].mean(axis=1), template.face_areas[inside]
 
 
 def _middle(template: Mesh, skeleton: Skeleton, parts: list[int]) -> np.ndarray:
+    """Return the centroid (3,) of some parts."""
     points, areas = _points(template, skeleton, parts)
     return areas @ points / areas.sum()
 
 
 def _bones(template: Mesh, skeleton: Skeleton, limb: list[int]) -> np.ndarray:
-    """(n + 1, 3): where each part of a limb begins, and the point of the last that is farthest from the first."""
+    """Return the joints of a limb and its far end (n + 1, 3); the end is the point farthest from the first joint."""
     trunk = next(q for q in _neighbours(skeleton)[limb[0]] if q not in limb)
     places = [_joint(skeleton, a, b) for a, b in zip(limb, [trunk, *limb], strict=False)]
     points, _ = _points(template, skeleton, limb[-1:])
@@ -160,10 +164,11 @@ def _bones(template: Mesh, skeleton: Skeleton, limb: list[int]) -> np.ndarray:
 
 
 def _way_left(template: Mesh, skeleton: Skeleton, person: _Person) -> np.ndarray | None:
-    """The direction (3,) to the person's left: up × front, front where the soles reach; None if that is not clear."""
+    """Find the direction (3,) to the person's left: up × front, front where the soles reach; None if unclear."""
     front, length = np.zeros(3), 0.0
     for leg in person.legs:
         points, areas = _points(template, skeleton, leg)
+        # of each leg: the lowest 5% are the sole, 12 to 22% of the height the ankle
         height = points @ person.up
         bottom, size = height.min(), np.ptp(height)
         sole = height < bottom + 0.05 * size
@@ -174,10 +179,12 @@ def _way_left(template: Mesh, skeleton: Skeleton, person: _Person) -> np.ndarray
                   - np.average(points[ankle], axis=0, weights=areas[ankle])) / 2
         length += size / 2
     front -= person.up * (front @ person.up)
+    # a foot must reach forward by 4% of the leg to be clear
     return np.cross(person.up, front) if np.linalg.norm(front) > 0.04 * length else None
 
 
 def _spine_names(person: _Person) -> list[str]:
+    """Name the chain from pelvis to head; surplus parts of abdomen and neck are numbered."""
     chest = person.spine.index(person.chest)
     trunk = (["trunk"] if chest == 0 else
              ["pelvis", *([] if chest == 1 else ["abdomen"] if chest == 2 else
@@ -191,13 +198,13 @@ def _spine_names(person: _Person) -> list[str]:
 
 def _limb_names(template: Mesh, skeleton: Skeleton, limb: list[int], kinds: dict[int, tuple[str, ...]], first: str
                 ) -> tuple[str, ...]:
-    """Names from the body outwards; limbs with more segments than are known are numbered."""
+    """Name a limb from the body outwards; the segments of limbs with more than three are numbered."""
     lengths = np.linalg.norm(np.diff(_bones(template, skeleton, limb), axis=0), axis=1)
     lead: tuple[str, ...] = ()
     if len(limb) in (3, 4) and lengths[0] < 0.45 * lengths[1]:          # too short for an upper arm or thigh
         lengths, lead = lengths[1:], (first,)
     n, whole = len(lengths), kinds[1][0]
-    # of a limb: elbows and knees are at 0.41 to 0.44, wrists, ankles at 0.75 to 0.81
-    if n == 2 and lengths[0] > 0.6 * lengths.sum():                     # the knee was never seen to bend, the ankle was
+    # elbows and knees are at 0.41 to 0.44 of the length of a limb, wrists and ankles at 0.75 to 0.81
+    if n == 2 and lengths[0] > 0.6 * lengths.sum():                     # the knee never bends, the ankle does
         return *lead, whole, kinds[3][-1]
     return (*lead, *kinds[n]) if n in kinds else tuple(f"{whole}{k + 1}" for k in range(n))

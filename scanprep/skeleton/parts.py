@@ -1,4 +1,4 @@
-"""Rigid parts of a surface, found from its poses without being told how many there are."""
+"""Find the rigid parts of a surface from its poses, and their number."""
 from __future__ import annotations
 
 from dataclasses import dataclass
@@ -11,8 +11,8 @@ from .motions import Moments, Motions, PosedSurface, agglomerate, fit_motions, h
 from .sides import Sides, cover, mirror_pairs
 from .symmetry import Symmetry
 
-SMALLEST = 0.005                 # of the surface: a smaller part is joined to a neighbour
-FADING = 0.8                     # a part dissolves when its neighbours' motions, blended, explain so much of its own
+SMALLEST = 0.005                 # share of the surface: a smaller part is merged with a neighbour
+FADING = 0.8                     # a part dissolves when a blend of its neighbours explains this share of its motion
 
 
 @dataclass(frozen=True)
@@ -22,21 +22,26 @@ class SkeletonConfig(Settings):
     Attributes
     ----------
     parts : int, optional
-        Exact number of parts; without it the data decide.
+        Exact number of parts; by default the data decide.
     separation : float
-        Two neighbours that are less apart become one part, see `PartSearch.separations`.
+        Neighbours with a smaller separation are merged, see `PartSearch.separations`.
     tolerance : float
         Residual, as a fraction of the square root of the surface area, that counts as rigid.
     patches : int
-        Number of patches of the first cover.
+        Number of initial patches.
     start : int
-        Number of parts after the patches were joined and before labels and motions alternate.
+        Number of parts after the patches are joined, before labels and motions alternate.
     symmetric : bool, optional
-        Whether left and right have the same parts; without it they have where the body is symmetric.
+        Whether left and right have the same parts; by default they do if the body is symmetric.
     restarts : int
-        So often the search begins anew, with other patches; the best result is kept.
+        Number of restarts with other patches; the best result is kept.
     seed : int
-        Of the random numbers that place the patches.
+        Seed of the random numbers that place the patches.
+
+    Examples
+    --------
+    >>> SkeletonConfig(parts=16).parts
+    16
     """
 
     parts: Annotated[Count | None, FLAG] = None
@@ -52,7 +57,7 @@ class SkeletonConfig(Settings):
 class PartSearch:
     """The moves of the search: alternate, join, split. With a symmetry every move is made on both sides.
 
-    The generator says where the first patches lie.
+    The generator places the initial patches.
     """
 
     def __init__(self, surface: PosedSurface, config: SkeletonConfig, symmetry: Symmetry | None = None,
@@ -60,21 +65,21 @@ class PartSearch:
         self.surface, self.config = surface, config
         self.sides = Sides(surface, symmetry)
         self.floor = config.tolerance**2 * surface.area
-        self.width = 0.01 / np.sqrt(surface.area)       # how much surface at mean cost a metre of border is worth
+        self.width = 0.01 / np.sqrt(surface.area)       # price of a metre of border, in surface at mean cost
         self.patch = cover(surface, min(config.patches, len(surface.face_weights)), self.sides, rng)
         self.forget()
 
     def forget(self) -> None:
-        """Forget what was worked out on the way, whose last digits depend on the way."""
+        """Clear the caches, whose last digits depend on the order of the moves."""
         self._cuts: dict[bytes, tuple[np.ndarray, float]] = {}
         self._gains: dict[bytes, float] = {}
 
     def motions(self, label: np.ndarray) -> Motions:
-        """Rigid motions of the parts (the M-step)."""
+        """Fit the rigid motions of the parts (the M-step)."""
         return fit_motions(self.surface.moments(label))
 
     def alternate(self, label: np.ndarray, rounds: int, core: bool = False) -> np.ndarray:
-        """Alternate labels and motions until the labels (F,) stay; motions from the core of the parts if so wished.
+        """Alternate labels (E-step) and motions (M-step) until the labels (F,) stay; `core` fits motions to part cores.
 
         [Articulated]
         """
@@ -86,31 +91,31 @@ class PartSearch:
             moved = self.sides.relabel(costs, self.price(motions, 1.0), label, self.sides.partners(label))
             changed = s.face_weights[moved != label].sum()
             label = moved
-            if changed < 5e-4:                                       # of the surface
+            if changed < 5e-4:                                       # share of the surface that still changes
                 break
         return np.unique(label, return_inverse=True)[1]
 
     def price(self, motions: Motions, share: float) -> float:
-        """Price of a metre of border where `share` of the surface follows the motions."""
+        """Return the price of a metre of border, where `share` of the surface follows the motions."""
         return self.width * max(float(motions.cost.sum()) / share, self.floor)
 
     def energy(self, label: np.ndarray) -> float:
-        """What a labelling costs, square metres: the residual of the parts and the price of their borders."""
+        """Compute the energy of a labelling, square metres: residual of the parts plus price of their borders."""
         s, motions = self.surface, self.motions(label)
         border = s.pair_lengths[label[s.pairs[:, 0]] != label[s.pairs[:, 1]]].sum()
         return float(motions.cost.sum() + self.price(motions, 1.0) * border)
 
     def contacts(self, label: np.ndarray) -> np.ndarray:
-        """(n, 2) pairs of labels that touch, lower first."""
+        """Return the pairs (n, 2) of labels that touch, lower first."""
         touching = np.sort(label[self.surface.pairs], axis=1)
         return np.unique(touching[touching[:, 0] != touching[:, 1]], axis=0)
 
     def separations(self, label: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """For all pairs of labels that touch (n, 2), how far apart they are and what their union costs more.
+        """Compute for all pairs of touching labels (n, 2) their separation and the extra cost of their union.
 
-        How far apart is the geometric mean of two ratios: the residual of one motion over that of two, and the
-        gain of the border over that of the best cut through the smaller part. The first tells a joint from a
-        surface that gives way everywhere, the second also from noise.
+        The separation is the geometric mean of two ratios: the residual of one motion over that of two, and the gain of
+        this border over that of the best cut through the smaller part. The first separates a joint from a surface that
+        is soft everywhere, the second also from noise.
         """
         moments = self.surface.moments(label)
         pairs = self.contacts(label)
@@ -119,11 +124,13 @@ class PartSearch:
         return pairs, *self._apart(moments, pairs, self._next_gains(label), self.sides.partners(label))
 
     def _next_gains(self, label: np.ndarray, first: int = 0) -> np.ndarray:
-        """(P,) square metres: what each part from `first` on would gain by its best cut along the patches."""
+        """Compute the gain (P,), square metres, of the best cut of each part from `first` on, along the patches."""
         P, K = int(label.max()) + 1, int(self.patch.max()) + 1
+        # gains are cached by the triangles of a part
         keys = [np.packbits(label == part).tobytes() for part in range(first, P)]
         new = [part for part, key in enumerate(keys, first) if key not in self._gains]
         if new:
+            # the patches of all new parts, joined down to two each
             used, piece = np.unique(label * K + self.patch, return_inverse=True)
             ours, contacts = np.flatnonzero(np.isin(used // K, new)), self.contacts(piece)
             number, place = np.full(len(used), -1), np.full(P, -1)
@@ -139,6 +146,7 @@ class PartSearch:
 
     def _apart(self, moments: Moments, pairs: np.ndarray, gains: np.ndarray, partner: np.ndarray
                ) -> tuple[np.ndarray, np.ndarray]:
+        """Compute the separation (n,) of pairs and the extra cost (n,) of their unions; see `separations`."""
         share = moments.w[pairs]
         cost = rigid_costs(moments)[pairs].sum(axis=1)
         extra = np.maximum(union_costs(moments, pairs) - cost, 0)
@@ -151,13 +159,13 @@ class PartSearch:
         return np.sqrt((1 + extra / base) * extra / gain), extra
 
     def join(self, label: np.ndarray, a: int, b: int) -> np.ndarray:
-        """Labels (F,) with a and b as one, on a symmetric body on both sides."""
+        """Merge labels a and b, on a symmetric body on both sides; return labels (F,)."""
         return self.sides.join(label, a, b, self.sides.partners(label))
 
     def join_down(self, label: np.ndarray) -> np.ndarray:
-        """Join the pair that is least apart, alternate, and so on, until all are apart and no part is too small.
+        """Merge pairs and alternate until all parts are separated and none is too small; cheapest unions first.
 
-        A pair whose union the alternation cuts again stays two.
+        A pair that the alternation splits again stays two.
         """
         label = self.alternate(label, rounds=2)
         while True:
@@ -173,49 +181,51 @@ class PartSearch:
                 return label
 
     def split(self, label: np.ndarray, part: int) -> tuple[np.ndarray, float]:
-        """Labels (F,) with one part cut where it bends most, and how far apart the pieces are, 0 where there is no cut.
+        """Cut one part where it bends most; return labels (F,) and the separation of the pieces, 0 without a cut.
 
-        In two or, in the middle of a symmetric body, in three.
+        It is cut in two or, in the middle of a symmetric body, in three.
         """
         partner = self.sides.partners(label)
-        mine = (label == part) | (label == partner[part])
-        key = mine.tobytes() + bytes([int(partner[part] == part)])
+        inside = (label == part) | (label == partner[part])
+        key = inside.tobytes() + bytes([int(partner[part] == part)])
         if key not in self._cuts:
-            self._cuts[key] = self._split(mine, label == part)
+            self._cuts[key] = self._split(inside, label == part)
         piece, apart = self._cuts[key]
         if apart == 0:
             return label, 0.0
-        return np.unique(np.where(mine, label.max() + piece, label), return_inverse=True)[1], apart
+        return np.unique(np.where(inside, label.max() + piece, label), return_inverse=True)[1], apart
 
-    def _split(self, mine: np.ndarray, one: np.ndarray) -> tuple[np.ndarray, float]:
-        """Pieces (F,), from 1, of a part and its mirror image, `mine` (F,) bool, and how far apart they are.
+    def _split(self, inside: np.ndarray, one: np.ndarray) -> tuple[np.ndarray, float]:
+        """Cut a part and its mirror image, `inside` (F,) bool; return pieces (F,), from 1, and their separation.
 
         `one` (F,) bool is the part alone.
         """
         s, sides = self.surface, self.sides
-        two = bool((mine & ~one).any())
-        local = np.zeros(len(mine), dtype=np.int64)             # 0 outside
-        local[mine] = np.unique(2 * self.patch[mine] + one[mine], return_inverse=True)[1] + 1
-        of_one = np.bincount(local, one & mine) > 0
+        two = bool((inside & ~one).any())
+        local = np.zeros(len(inside), dtype=np.int64)             # 0 outside
+        local[inside] = np.unique(2 * self.patch[inside] + one[inside], return_inverse=True)[1] + 1
+        # join the patches down to two sets; patches of the part never join those of its mirror image
+        of_one = np.bincount(local, one & inside) > 0
         among = self.contacts(local)
         among = among[(among[:, 0] > 0) & (of_one[among[:, 0]] == of_one[among[:, 1]])] - 1
         partner = sides.partners(local)[1:] - 1 if sides.tied else None
         piece = agglomerate(s.moments(local)[1:], among, 2, partner)
-        local[mine] = piece[local[mine] - 1] + 1
-        weights = s.face_weights[mine]
+        local[inside] = piece[local[inside] - 1] + 1
+        # alternate motions and labels a few times inside the part
+        weights = s.face_weights[inside]
         for _ in range(4):
-            shares = np.bincount(local[mine] - 1, weights)
+            shares = np.bincount(local[inside] - 1, weights)
             if len(shares) < (4 if two else 2) or shares.min() < SMALLEST:
                 return local, 0.0
             motions = fit_motions(s.moments(local)[1:])
             partner = sides.partners(local)[1:] - 1 if sides.tied else np.arange(len(shares))
             moved = sides.relabel(s.face_costs(motions), self.price(motions, weights.sum()),
-                                  np.maximum(local - 1, 0), partner, mine)
-            local[mine] = np.unique(moved[mine], return_inverse=True)[1] + 1
+                                  np.maximum(local - 1, 0), partner, inside)
+            local[inside] = np.unique(moved[inside], return_inverse=True)[1] + 1
         return local, self._least_apart(local, one, two)
 
     def _least_apart(self, local: np.ndarray, one: np.ndarray, two: bool) -> float:
-        """How far apart the least separate pieces of a part are."""
+        """Return the smallest separation between the pieces of a part."""
         moments, pairs = self.surface.moments(local)[1:], self.contacts(local)
         pairs = pairs[pairs[:, 0] > 0]
         if two:
@@ -228,15 +238,15 @@ class PartSearch:
 
 
 def find_parts(search: PartSearch) -> np.ndarray:
-    """Labels (F,) of triangles, each connected, that move through the poses as rigidly as can be.
+    """Find connected labels (F,) of triangles that move as rigidly as possible through the poses.
 
-    Many patches are joined greedily, labels and motions alternate while the least separate parts go on
-    being joined; then parts are cut where that shows a motion not yet found.
+    Many patches are joined greedily. Labels and motions alternate while the least separated parts are merged. Then
+    parts are cut where that reveals a motion not yet found.
 
     [Articulated]
     """
     patch, tied = search.patch, search.sides.tied
-    sets = -(-3 * search.config.start // 5) if tied else search.config.start    # a part and its image are one
+    sets = -(-3 * search.config.start // 5) if tied else search.config.start    # a part and its mirror image are one
     label = agglomerate(search.surface.moments(patch), search.contacts(patch), sets,
                         search.sides.partners(patch) if tied else None)[patch]
     label = _split_and_join(search, search.join_down(label))
@@ -244,7 +254,7 @@ def find_parts(search: PartSearch) -> np.ndarray:
 
 
 def _split_and_join(search: PartSearch, label: np.ndarray) -> np.ndarray:
-    """Cut parts and join again, as long as that gives more parts, or as many that fit better."""
+    """Cut parts and merge again, as long as that gives more parts, or as many that fit better."""
     tried: set[bytes] = set()
     for _ in range(2 * search.config.start):
         cuts = [search.split(label, part) for part in range(label.max() + 1)]
@@ -254,6 +264,7 @@ def _split_and_join(search: PartSearch, label: np.ndarray) -> np.ndarray:
         cut = max(worth, key=lambda c: c[1])[0]
         tried.add(cut.tobytes())
         again = search.join_down(cut)
+        # as many parts must fit better by half a per cent
         more = again.max() - label.max()
         if more > 0 or (more == 0 and search.motions(again).cost.sum() < 0.995 * search.motions(label).cost.sum()):
             label = again

@@ -1,4 +1,4 @@
-"""The search for a skeleton, begun anew several times, and its best result."""
+"""The search for a skeleton with several restarts, and the choice of the best."""
 from __future__ import annotations
 
 from collections.abc import Callable
@@ -33,10 +33,10 @@ Tree = tuple[np.ndarray, np.ndarray, list[Loop]]
 
 
 class SkeletonFinder:
-    """The search, begun anew several times: skeletons of any number of parts follow from the same restarts.
+    """The search with several restarts; skeletons with any number of parts follow from the same restarts.
 
-    Arguments and errors are those of `find_skeleton`; the number of parts of the settings does not matter. `runs` are
-    the restarts, the best first, `first` the one that was begun first.
+    Arguments and errors are those of `find_skeleton`; the requested number of parts does not matter here. `runs` are
+    the restarts, best first; `first` is the one that was started first.
 
     [Articulated]
     """
@@ -53,27 +53,29 @@ class SkeletonFinder:
         bad = np.flatnonzero(~np.isfinite(poses).all(axis=(1, 2)))
         if len(bad):
             raise ValueError(f"poses: {len(bad)} have vertices that are not finite, the first is pose {bad[0]}")
+        # left and right are tied if the body is symmetric, or if the settings say so
         self.template, self.config, self.symmetry = template, config, find_symmetry(template, poses)
         tied = self.symmetry.holds if config.symmetric is None else config.symmetric
         if tied and not self.symmetry.two_sided:
             raise ValueError("symmetric: this template has no two sides")
         tell, self.surface = _progress(progress, config.restarts), PosedSurface(template, poses)
-        # a restart knows nothing of the count of parts or of the other restarts
+        # a restart does not depend on the requested number of parts or on the other restarts: cached results stay valid
         kept = partial(step, inputs=(template, poses, replace(config, parts=None, restarts=1)))
         symmetry = self.symmetry if tied else None
         runs = _restarts(self.surface, config, symmetry, tell, kept)                # [Articulated] E- and M-steps
-        if tied and self.symmetry.holds and _is_held_back(_best(runs)):     # few poses: a limb bends on one side alone
+        if tied and self.symmetry.holds and _is_held_back(_best(runs)):     # few poses: a limb bends on one side only
             both = np.concatenate([poses, mirror_poses(template, poses, self.symmetry)])
             self.surface = PosedSurface(template, both)
             runs = _restarts(self.surface, config, symmetry, tell, kept, "mirrored")
         self.first, self.runs = runs[0], sorted(runs, key=lambda run: run.score)
 
     def skeleton(self, run: Restart, parts: int | None) -> tuple[Skeleton, bool]:
-        """The skeleton that a restart leads to, of so many parts if told, and whether left and right are alike."""
+        """Build the skeleton of a restart, with `parts` parts if given; and say whether left and right are alike."""
         surface, config = self.surface, replace(self.config, parts=parts)
         label, links, tied = _of_count(run, surface, config)
         if tied:
-            # labels of the same tree after the borders of both sides moved each by itself: no body is quite symmetric
+            # let the borders of both sides move freely, as no body is quite symmetric; keep that if the tree stays the
+            # same
             free = PartSearch(surface, replace(config, patches=2))
             moved = free.alternate(label, rounds=12, core=True)
             touching = {tuple(pair) for pair in free.contacts(moved).tolist()}
@@ -87,7 +89,7 @@ class SkeletonFinder:
 
 
 def _progress(progress: Callable[[int, int], None] | None, restarts: int) -> Callable[[], None]:
-    """Tells of one more restart; restarts may double where a body turns out not to be symmetric."""
+    """Return a callback that counts restarts; there may be twice as many if limbs bend on one side only."""
     done, total = 0, restarts + 1
 
     def tell() -> None:
@@ -101,19 +103,19 @@ def _progress(progress: Callable[[int, int], None] | None, restarts: int) -> Cal
 
 @dataclass(frozen=True, eq=False)
 class Restart:
-    """One beginning of the search and where it ended."""
+    """One restart of the search and its result."""
 
     label: np.ndarray  # (F,) int: parts
     links: np.ndarray  # (P - 1, 2) int
     loops: list[Loop]
-    energy: float  # residual of the parts and price of their borders, as a share of the squared size of the body
-    score: float  # logarithm of the energy, and what every part must be worth; the lowest is best
+    energy: float  # residual plus price of borders, as a share of the squared size of the body
+    score: float  # log of the energy plus a penalty per part; the lowest is best
     search: PartSearch
 
 
 def _restarts(surface: PosedSurface, config: SkeletonConfig, symmetry: Symmetry | None, tell: Callable[..., None],
               kept: Callable[..., Tree], poses: str = "") -> list[Restart]:
-    """All restarts; `poses` says which, for what is kept."""
+    """Run all restarts in parallel; `poses` names the set of poses in the cache."""
     rng = np.random.default_rng(config.seed)
     searches = [PartSearch(surface, config, symmetry, rng) for _ in range(config.restarts)]
     runs = []
@@ -129,11 +131,13 @@ def _restarts(surface: PosedSurface, config: SkeletonConfig, symmetry: Symmetry 
 
 
 def _best(runs: list[Restart]) -> Restart:
+    """Return the restart with the lowest score."""
     return min(runs, key=lambda run: run.score)
 
 
 def _search(search: PartSearch) -> Tree:
-    """Labels and links of a tree, and the loops that were opened for it."""
+    """Run one restart: labels and links of a tree, and the loops that were opened."""
+    # rigid parts; without bands of skin; as a tree; with parts merged and cut while that helps; settled
     label = find_parts(search)                                                      # [Articulated]
     label = dissolve_bands(search, label)
     label, links, loops = to_tree(search, label)                                    # [SCAPE] §3
@@ -142,17 +146,17 @@ def _search(search: PartSearch) -> Tree:
 
 
 def _score(search: PartSearch, label: np.ndarray) -> float:
-    """What is compared: the logarithm of the energy, and what every part must be worth."""
+    """Compute the score of a labelling: log of the energy plus a penalty per part."""
     energy = search.energy(label) / search.surface.area
-    # a part counts that lowers the logarithm of the energy by a tenth
+    # a part must lower the log of the energy by a tenth; the tolerance keeps the logarithm finite
     return float(np.log(energy + search.config.tolerance**2) + 0.1 * (label.max() + 1))
 
 
 def _improve(search: PartSearch, label: np.ndarray, links: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Labels and links of a tree after parts were joined, and cut, as long as the score falls.
+    """Merge and cut parts of a tree as long as the score falls; return labels and links.
 
-    Only parts that are not well apart are joined: hands are too small to lower the energy much. A cut that makes a mere
-    band of skin does not count.
+    Only parts that are not well separated are merged, because hands are too small to lower the energy much. A cut that
+    creates a mere band of skin is rejected.
     """
     score = _score(search, label)
     for _ in range(search.config.start):
@@ -174,22 +178,22 @@ def _improve(search: PartSearch, label: np.ndarray, links: np.ndarray) -> tuple[
 
 
 def _settle(search: PartSearch, label: np.ndarray, links: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Labels and links of a tree after labels and core motions alternated to the end, if it still is that tree."""
+    """Alternate labels and core motions to the end; keep the result only if the tree stays the same."""
     moved = search.alternate(label, rounds=12, core=True)
     tree = without_weak(search, moved)
     return (moved, tree) if moved.max() == label.max() and len(tree) == len(links) else (label, links)
 
 
 def _is_held_back(run: Restart) -> bool:
-    """Whether parts that need not be symmetric would fit far better, beginning with those found."""
+    """Test whether parts without the symmetry would fit far better: an energy lower by 15%."""
     free = PartSearch(run.search.surface, replace(run.search.config, patches=2))
     return free.energy(free.alternate(run.label, rounds=10)) < 0.85 * run.search.energy(run.label)
 
 
 def _of_count(best: Restart, surface: PosedSurface, config: SkeletonConfig) -> tuple[np.ndarray, np.ndarray, bool]:
-    """Labels and links of exactly as many parts as asked for, and whether they are symmetric.
+    """Return labels and links with the requested number of parts, and whether they are symmetric.
 
-    A count that no symmetric tree has is reached with one part that is not.
+    If no symmetric tree has that number, the symmetry is given up.
     """
     tied = best.search.sides.tied
     if config.parts is None:
@@ -204,7 +208,7 @@ def _of_count(best: Restart, surface: PosedSurface, config: SkeletonConfig) -> t
 
 
 def _assemble(template: Mesh, label: np.ndarray, links: np.ndarray, joints: np.ndarray) -> Skeleton:
-    """Number the parts from the middle outwards and hang every joint on its child."""
+    """Number the parts from the middle outwards and assign every joint to its child."""
     P = int(label.max()) + 1
     areas = np.bincount(label, template.face_areas, P)
     centres = np.stack([np.bincount(label, template.face_areas * c, P)

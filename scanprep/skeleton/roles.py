@@ -1,6 +1,6 @@
-"""The one vocabulary of the parts of people: our names, what others call them, and the joints they hang on.
+"""The vocabulary of the parts of people: our names, those of other programs, and the joints they hang on.
 
-A part is called after what it is, its side behind it: `thigh_left`. Models of other programs, and files of older
+The name of a part ends with its side: `thigh_left`. Models of other programs, and files of older
 versions (`l_thigh`), are understood by `find_roles` and `part_name`.
 """
 from __future__ import annotations
@@ -15,16 +15,16 @@ from ..geometry.sides import split_side
 
 
 class Role(NamedTuple):
-    """A joint of the humanoid: our name of the part that turns there, the joint in words, and its names elsewhere."""
+    """A joint of the humanoid: our name of the part it moves, the joint in words, and its names in other programs."""
 
     part: str
     joint: str
     words: tuple[str, ...]
 
 
-# Keys are H-Anim's joints. Words are those of motion databases and animation programs, in small letters without
-# separators; the first that a skeleton has is taken, and none twice. A knee may be a "leg" (below an "up leg") and a
-# clavicle a "shoulder" (above an "arm"): so the order of the rows matters.
+# Keys are H-Anim's joints. Words are names in motion databases and animation programs, in lower case without
+# separators. The first word that a skeleton has is taken, and no joint twice. A knee may be called "leg" (below an "up
+# leg") and a clavicle "shoulder" (above an "arm"), so the order of the rows matters.
 ROLES = {
     "humanoid_root": Role("pelvis", "pelvis", ("sacroiliac", "pelvis", "hips", "humanoidroot", "hip", "root", "trunk")),
     "skullbase": Role("head", "neck", ("skullbase", "head", "skull", "neck1", "neck")),
@@ -44,24 +44,24 @@ NEEDED = ("humanoid_root", "l_hip", "r_hip", "l_shoulder", "r_shoulder")
 
 
 def part_name(name: str) -> str:
-    """A part's name as we spell it, whatever the spelling of its side: hand_left for l_hand, HandLeft, or hand.L."""
+    """Return a part's name in our spelling: hand_left for l_hand, HandLeft, or hand.L."""
     plain, side = split_side(name)
     return f"{plain}_{side}".replace(" ", "_") if plain and side else name
 
 
 def part_kind(name: str) -> str:
-    """What a part is, on either side and of any number: thigh for thigh2_left and l_thigh."""
+    """Return a part's name without side and number: thigh for thigh2_left and l_thigh."""
     return split_side(name)[0].rstrip("0123456789")
 
 
 def in_words(name: str) -> str:
-    """A part's name as a sentence has it: "left forearm" for forearm_left and l_forearm."""
+    """Return a part's name in words: "left forearm" for forearm_left and l_forearm."""
     plain, side = split_side(name)
     return f"{side} {plain}".strip().replace("_", " ")
 
 
 def joint_in_words(name: str) -> str:
-    """The joint that a part hangs on, from the part's name: "left elbow" for forearm_left."""
+    """Return in words the joint that a part hangs on: "left elbow" for forearm_left."""
     joints = {role.part: role.joint for role in (ROLES["skullbase"], *SIDED_ROLES.values()) if role.part != "shoulder"}
     plain, side = split_side(name)
     joint = (joints | {"arm": "shoulder", "leg": "hip"}).get(plain)
@@ -69,15 +69,14 @@ def joint_in_words(name: str) -> str:
 
 
 def find_roles(names: Sequence[str]) -> dict[str, int]:
-    """The joints that play the parts of the humanoid, {H-Anim name: joint}; case, separators and what stands before a
-    colon do not matter.
-    """
+    """Map H-Anim names to joints, {name: joint}; case, separators and a prefix before a colon do not matter."""
     plain: dict[str, int] = {}
     for j, name in enumerate(names):
+        # bare letters, without prefixes and suffixes of programs such as mixamorig, bip01, def, _jnt
         letters = re.sub(r"[^a-z0-9]", "", name.rsplit(":", 1)[-1].lower())
         letters = re.sub(r"^(mixamorig|bip|jbipc?|def|character)\d*", "", letters)
         plain.setdefault(re.sub(r"(jnt|bone)$", "", letters), j)
-    # limbs that are cut into numbered pieces: the first is where the joint is
+    # limbs in numbered pieces: the joint is at the first
     for name, j in list(plain.items()):
         plain.setdefault(re.sub(r"0?1(left|right|[lr])$", r"\1", name), j)
     forms = {name: role.words for name, role in ROLES.items()}
@@ -93,16 +92,16 @@ def find_roles(names: Sequence[str]) -> dict[str, int]:
 
 
 def limb_parts(names: Sequence[str], parents: np.ndarray, joints: np.ndarray, limb: str, side: str) -> list[int]:
-    """The parts of an "arm" or "leg" of the "left" or "right", from the body outwards; none where it is not named."""
+    """Return the parts of an "arm" or "leg" of the "left" or "right", from the body outwards; empty where not named."""
     roles = find_numbered_roles(names, joints)
-    found = [roles[f"{side[0]}_{role}"] for role in LIMBS[limb] if f"{side[0]}_{role}" in roles]
-    return way(parents, found[0], found[-1]) if found else []
+    named = [roles[f"{side[0]}_{role}"] for role in LIMBS[limb] if f"{side[0]}_{role}" in roles]
+    return way(parents, named[0], named[-1]) if named else []
 
 
 def find_numbered_roles(names: Sequence[str], joints: np.ndarray) -> dict[str, int]:
-    """`find_roles`, also of limbs that are numbered outwards (arm1_left, arm2_left, ...), with joints (J, 3) at rest.
+    """Map H-Anim names to joints as `find_roles` does, and also to numbered limbs (arm1_left, arm2_left, ...).
 
-    Of such a limb the elbow or knee is where it leaves two pieces that are most alike.
+    `joints` (J, 3) are at rest. The elbow or knee of a numbered limb divides it into the most equal halves.
     """
     roles, names = find_roles(names), [part_name(name) for name in names]
     for side, spelt in (("l", "left"), ("r", "right")):
@@ -110,9 +109,9 @@ def find_numbered_roles(names: Sequence[str], joints: np.ndarray) -> dict[str, i
             chain = [names.index(f"{limb}{k}_{spelt}") for k in range(1, 20) if f"{limb}{k}_{spelt}" in names]
             if len(chain) > len(wanted):
                 starts = range(1) if limb == "leg" else range(len(chain) - 2)
-                found = _pieces(joints[chain], starts)
-                roles |= {f"{side}_{role}": chain[k] for role, k in zip(wanted, found, strict=True)}
-                if limb == "arm" and found[0]:
+                pieces = _pieces(joints[chain], starts)
+                roles |= {f"{side}_{role}": chain[k] for role, k in zip(wanted, pieces, strict=True)}
+                if limb == "arm" and pieces[0]:
                     roles[f"{side}_sternoclavicular"] = chain[0]
             elif f"{limb}_{spelt}" in names:
                 roles[f"{side}_{wanted[0]}"] = names.index(f"{limb}_{spelt}")
@@ -121,12 +120,18 @@ def find_numbered_roles(names: Sequence[str], joints: np.ndarray) -> dict[str, i
 
 
 def missing_joints(names: Sequence[str], joints: np.ndarray) -> list[str]:
-    """The joints of people, in words, that a person's skeleton has not; none for a body that is no person.
+    """List the joints, in words, that a person's skeleton lacks; empty for a body that is no person.
 
     Parameters
     ----------
-    names : names of the J parts
-    joints : (J, 3) float, metres, at rest
+    names : sequence of str
+        Names of the J parts.
+    joints : (J, 3) float, metres
+        Joints at rest.
+
+    Returns
+    -------
+    list of str
     """
     roles = find_numbered_roles(names, joints)
     if not set(NEEDED) <= set(roles):
@@ -139,7 +144,7 @@ def missing_joints(names: Sequence[str], joints: np.ndarray) -> list[str]:
 
 
 def _pieces(joints: np.ndarray, starts: range) -> tuple[int, int, int]:
-    """Which joints (n, 3) of a limb begin its upper piece, its lower piece and its end."""
+    """Find the joints (of n, 3) where the upper piece, the lower piece and the end of a limb begin."""
     along = np.r_[0, np.cumsum(np.linalg.norm(np.diff(joints, axis=0), axis=1))]
     last = len(joints) - 1
     pairs = [(s, e) for s in starts for e in range(s + 1, last)]
@@ -148,7 +153,7 @@ def _pieces(joints: np.ndarray, starts: range) -> tuple[int, int, int]:
 
 
 def above(parents: np.ndarray, j: int) -> list[int]:
-    """The joint, its parent, and so on up to the root."""
+    """Return the joint, its parent, and so on up to the root."""
     chain = [j]
     while parents[chain[-1]] >= 0:
         chain.append(int(parents[chain[-1]]))
@@ -156,15 +161,16 @@ def above(parents: np.ndarray, j: int) -> list[int]:
 
 
 def way(parents: np.ndarray, start: int, end: int) -> list[int]:
-    """The parts from one to another along the tree, both with them."""
+    """Return the parts from one to another along the tree, including both."""
     up, down = above(parents, start), above(parents, end)
     meet = next(j for j in up if j in down)
     return [*up[:up.index(meet)], *down[:down.index(meet) + 1][::-1]]
 
 
 def trunk(parents: np.ndarray, roles: Mapping[str, int]) -> tuple[int, int]:
-    """The lowest joint of the trunk above the pelvis, and the one that carries arms and head; the pelvis for both where
-    the tree has none between.
+    """Return the lowest joint of the trunk above the pelvis, and the one that carries arms and head.
+
+    Both are the pelvis where the tree has none between.
     """
     pelvis = roles["humanoid_root"]
     chains = [above(parents, roles[role]) for role in ("l_shoulder", "r_shoulder") if role in roles]

@@ -1,7 +1,7 @@
-"""Left and right tied: one side of a symmetric body is labelled, the other is its mirror image.
+"""Tie left and right: one side of a symmetric body is labelled, the other is its mirror image.
 
-Every label has a partner, the label of the mirrored triangles; a label in the middle is its own. A body that is not
-symmetric is all one side: then nothing is tied, and every label counts as its own partner.
+Every label has a partner, the label of the mirrored triangles. A label in the middle is its own partner. On a body that
+is not symmetric nothing is tied, and every label is its own partner.
 """
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ from .symmetry import Symmetry
 
 
 class Sides:
-    """The side that is labelled and what follows from it on the other; without a symmetry nothing is tied.
+    """The side that is labelled and its map to the other side; without a symmetry nothing is tied.
 
-    `half` (H,) are the triangles that are labelled, `home` (F,) the place in it of every triangle or of its mirror
-    image, `mirrored` (F,) bool those that take the partner of the label of their home.
+    `half` (H,) are the triangles that are labelled. `home` (F,) is the index in `half` of every triangle or of its
+    mirror image. `mirrored` (F,) bool are triangles that take the partner of their home's label.
     """
 
     def __init__(self, surface: PosedSurface, symmetry: Symmetry | None = None) -> None:
@@ -32,38 +32,40 @@ class Sides:
             number = np.full(F, -1)
             number[self.half] = np.arange(len(self.half))
             self.home = number[np.where(self.mirrored, symmetry.partner, np.arange(F))]
+        # neighbours on the labelled side, and neighbours across the mirror plane
         across = self.mirrored[surface.pairs]
         own, over = ~across.any(axis=1), across[:, 0] != across[:, 1]
         self.pairs = self.home[surface.pairs[own]]
-        self.lengths = surface.pair_lengths[own] * (2 if self.tied else 1)          # the mirrored borders count too
-        self.middle = np.bincount(self.home[surface.pairs[over]].ravel(),           # metres of border over the plane
+        self.lengths = surface.pair_lengths[own] * (2 if self.tied else 1)          # with the mirrored borders
+        self.middle = np.bincount(self.home[surface.pairs[over]].ravel(),           # metres of border on the plane
                                   np.repeat(surface.pair_lengths[over] / 2, 2), len(self.half))
         self.areas = surface.face_weights[self.half]
 
     def partners(self, label: np.ndarray) -> np.ndarray:
-        """(P,) the partner of every label (F,)."""
+        """Find the partner (P,) of every label (F,): most of its mirrored triangles have it, and vice versa."""
         P = int(label.max()) + 1
         if not self.tied:
             return np.arange(P)
         there = self.mirrored
         table = np.bincount(label[self.half][self.home[there]] * P + label[there], minlength=P * P).reshape(P, P)
         table = table + table.T
-        found = np.where(table.any(axis=1), table.argmax(axis=1), np.arange(P))
-        return np.where(found[found] == np.arange(P), found, np.arange(P))
+        partner = np.where(table.any(axis=1), table.argmax(axis=1), np.arange(P))
+        return np.where(partner[partner] == np.arange(P), partner, np.arange(P))
 
     def spread(self, label: np.ndarray, partner: np.ndarray) -> np.ndarray:
-        """(F,) labels of all triangles from those of the labelled side (H,)."""
+        """Extend labels of the labelled side (H,) to all triangles (F,)."""
         everywhere = label[self.home]
         return np.where(self.mirrored, partner[everywhere], everywhere)
 
     def relabel(self, costs: np.ndarray, price: float, label: np.ndarray, partner: np.ndarray,
                 inside: np.ndarray | None = None) -> np.ndarray:
-        """Better labels (F,) for costs (F, P) and a price for every metre of border, every label connected.
+        """Improve labels (F,) for costs (F, P) and a price per metre of border, keeping every label connected.
 
-        Only triangles `inside` (F,) bool change; the labels of the others do not matter to them.
+        Only triangles `inside` (F,) bool change; the labels of the others are ignored.
         """
         here = np.arange(len(self.half)) if inside is None else np.flatnonzero(inside[self.half])
         P = costs.shape[1]
+        # costs of both sides together; a label on the plane that is not its own partner has a border there
         both = costs[self.half]
         if self.tied:
             there = np.flatnonzero(self.mirrored)
@@ -72,17 +74,17 @@ class Sides:
             both += price * self.middle[:, None] * (partner != np.arange(P))
         within = slice(None) if inside is None else np.isin(self.pairs, here).all(axis=1)
         pairs, prices = np.searchsorted(here, self.pairs[within]), price * self.lengths[within]
-        mine = label[self.half][here]
-        mine = relabel(both[here], pairs, prices, mine, rounds=2)
-        mine = keep_connected(both[here], pairs, self.areas[here], mine)
-        mine, partner = self._apart(mine, partner, here)
+        labels = label[self.half][here]
+        labels = relabel(both[here], pairs, prices, labels, rounds=2)
+        labels = keep_connected(both[here], pairs, self.areas[here], labels)
+        labels, partner = self._apart(labels, partner, here)
         out = label[self.half]
-        out[here] = mine
+        out[here] = labels
         spread = self.spread(out, partner)
         return spread if inside is None else np.where(inside, spread, label)
 
     def _apart(self, label: np.ndarray, partner: np.ndarray, here: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """A label of the middle that does not reach the plane any more becomes two."""
+        """Split a middle label that no longer touches the mirror plane into two partners."""
         if not self.tied:
             return label, partner
         at_plane = np.unique(label[self.middle[here] > 0])
@@ -93,7 +95,7 @@ class Sides:
         return label, partner
 
     def join(self, label: np.ndarray, a: int, b: int, partner: np.ndarray) -> np.ndarray:
-        """Labels with a and b as one, and their partners as one."""
+        """Merge labels a and b, and merge their partners."""
         sets = closure(a, b, partner)
         for together in sets:
             label = np.where(np.isin(label, together), together[0], label)
@@ -101,27 +103,28 @@ class Sides:
 
 
 def reductions(pairs: np.ndarray, partner: np.ndarray) -> np.ndarray:
-    """(n,) how many labels fewer there are when the pairs (n, 2) of labels become one each."""
+    """Return by how much the number of labels falls (n,) when each of the pairs (n, 2) is merged."""
     a, b = pairs.T
     return np.where((partner[a] == b) | ((partner[a] == a) & (partner[b] == b)), 1, 2)
 
 
 def mirror_pairs(pairs: np.ndarray, partner: np.ndarray) -> np.ndarray:
-    """(n,) for pairs (n, 2), lower first, where among them their mirror image is, or they where it is not there."""
+    """Return for pairs (n, 2), lower first, the index (n,) of their mirror image, or their own if there is none."""
     number = {(int(a), int(b)): i for i, (a, b) in enumerate(pairs)}
     image = np.sort(partner[pairs], axis=1)
     return np.array([number.get((int(a), int(b)), i) for i, (a, b) in enumerate(image)], dtype=np.int64)
 
 
 def cover(surface: PosedSurface, count: int, sides: Sides, rng: np.random.Generator | None = None) -> np.ndarray:
-    """(F,) patch of every triangle: about `count` seeds, each the farthest from those before, along the surface.
+    """Divide the surface into about `count` patches (F,) around farthest points along the surface.
 
-    The first is the farthest from the middle or, with `rng`, any. On a symmetric body the patches of one side are
-    the mirror images of those of the other.
+    The first point is the farthest from the centroid, or random with `rng`. On a symmetric body the patches of one side
+    are the mirror images of those of the other.
     """
     half, n = sides.half, len(sides.half)
     centre = surface.x[surface.mesh.faces[half]].mean(axis=1)
     a, b = sides.pairs.T
+    # graph of neighbouring triangles; every triangle joins the seed with the shortest path
     step = np.linalg.norm(centre[a] - centre[b], axis=1)
     graph = csr_array(coo_array((np.r_[step, step], (np.r_[a, b], np.r_[b, a])), shape=(n, n)))
     seed = int(np.linalg.norm(centre, axis=1).argmax()) if rng is None else int(rng.integers(n))

@@ -1,4 +1,4 @@
-"""The left-right symmetry of a body, from its surface alone: which triangle is the mirror image of which."""
+"""Find the left-right symmetry of a body from its surface alone: the mirror image of every triangle."""
 from __future__ import annotations
 
 from dataclasses import dataclass
@@ -12,29 +12,30 @@ from ..geometry.sparse import factor
 from ..geometry.surface import OrientedPoints, Surface
 from .labels import keep_connected
 
-NORMAL_WEIGHT = 0.05                 # of the body's size: how much distance a difference of normals weighs
+NORMAL_WEIGHT = 0.05                 # distance that equals a unit difference of normals, in sizes
 
 
 @dataclass(frozen=True, eq=False)
 class MirrorPlane:
-    """A plane that mirrors points."""
+    """A mirror plane."""
 
     normal: np.ndarray  # (3,) float, unit
     point: np.ndarray  # (3,) float, metres: on the plane
 
     @staticmethod
     def between(x: np.ndarray, y: np.ndarray) -> MirrorPlane:
-        """The plane that mirrors points (n, 3) as nearly as can be onto y (n, 3), by least squares."""
+        """Fit the plane that mirrors points x (n, 3) onto y (n, 3), by least squares."""
+        # the normal is the eigenvector of the smallest eigenvalue of the symmetric cross-covariance
         cross = (x - x.mean(axis=0)).T @ (y - y.mean(axis=0))
         return MirrorPlane(np.linalg.eigh(cross + cross.T)[1][:, 0], (x.mean(axis=0) + y.mean(axis=0)) / 2)
 
     @property
     def matrix(self) -> np.ndarray:
-        """(3, 3) the reflection M of directions."""
+        """The reflection M (3, 3) of directions."""
         return np.eye(3) - 2 * np.outer(self.normal, self.normal)
 
     def reflect(self, points: np.ndarray) -> np.ndarray:
-        """Mirrored points (..., 3), metres."""
+        """Mirror points (..., 3), metres."""
         return points - 2 * ((points - self.point) @ self.normal)[..., None] * self.normal
 
 
@@ -42,8 +43,8 @@ class MirrorPlane:
 class Symmetry(MirrorPlane):
     """The plane of symmetry, in the coordinates of the body it was found in, and the mirror image of every triangle."""
 
-    # (F,) int: the triangle where the mirror image of each triangle lies; for many, but not all, of an odd
-    # triangulation the partner's partner is the triangle itself
+    # (F,) int: the triangle at the mirror image of each triangle; its partner is usually, but not always, the triangle
+    # itself, as triangulations are not symmetric
     partner: np.ndarray
     left: np.ndarray  # (F,) bool: on the side the normal points to
     distance: float  # of the mirror image from the body, RMS, as a share of the body's size
@@ -53,7 +54,7 @@ class Symmetry(MirrorPlane):
 
     @property
     def holds(self) -> bool:
-        """Whether the body is symmetric: its mirror image lies near, and most of it comes back when mirrored twice."""
+        """Whether the body is symmetric: within 3% of its size, and 80% of it returns when mirrored twice."""
         return self.distance <= 0.03 and self.returns >= 0.8
 
     @property
@@ -63,45 +64,46 @@ class Symmetry(MirrorPlane):
 
 
 def mirror_poses(template: Mesh, poses: np.ndarray, symmetry: Symmetry) -> np.ndarray:
-    """Poses (M, N, 3), metres, with left and right exchanged: what a body does on one side it can do on the other."""
+    """Mirror poses (M, N, 3), metres: exchange left and right, as a body can do on both sides what it does on one."""
     body = template if symmetry.pose < 0 else template.with_vertices(poses[symmetry.pose])
     image = Surface(body).closest(symmetry.image)
     return symmetry.reflect(np.stack([image.transfer(pose, template.faces) for pose in poses]))
 
 
 def find_symmetry(template: Mesh, poses: np.ndarray | None = None) -> Symmetry:
-    """The best mirror symmetry of a body.
+    """Find the best mirror symmetry of a body.
 
-    It is sought at rest and, where the body does not stand symmetrically there, in its most symmetric pose: planes in
-    all directions through the middle, the best ones fitted to nearest points, and a smooth warp from the mirror image
-    onto the body, so that a stance that is not quite symmetric does no harm. Nothing is taken from the numbers of
-    vertices. `holds` says whether the body is symmetric at all.
+    It is searched at rest. If the body is not symmetric there, the most symmetric pose is used. Planes in all
+    directions through the centre are tried, and the best ones are refined by nearest points. A smooth warp of the
+    mirror image onto the body then tolerates a stance that is not quite symmetric. Vertex numbering is not used.
+    `holds` says whether the body is symmetric at all.
     """
-    few = _spread(template, 800)
-    at_rest = _match(template, _best_plane(template, few)[1], -1)
+    sample = _spread(template, 800)
+    at_rest = _match(template, _best_plane(template, sample)[1], -1)
     if at_rest.holds or poses is None:
         return at_rest
+    # 24 poses at most, spread over all, are enough to find a symmetric one
     chosen = np.unique(np.linspace(0, len(poses) - 1, min(len(poses), 24)).astype(int))
-    planes = [_best_plane(template.with_vertices(poses[m]), few) for m in chosen]
+    planes = [_best_plane(template.with_vertices(poses[m]), sample) for m in chosen]
     best = int(np.argmin([distance for distance, _ in planes]))
     posed = _match(template.with_vertices(poses[chosen[best]]), planes[best][1], int(chosen[best]))
     return posed if posed.holds or posed.distance < at_rest.distance else at_rest
 
 
 def _spread(template: Mesh, count: int) -> np.ndarray:
-    """About `count` vertices spread over the surface, each the nearest to one of evenly drawn points."""
+    """Choose about `count` vertices spread evenly over the surface."""
     points = template.sample(count, np.random.default_rng(0))[0]
     return np.unique(cKDTree(template.vertices).query(points)[1])
 
 
-def _best_plane(body: Mesh, few: np.ndarray) -> tuple[float, MirrorPlane]:
-    """Distance of the mirror image (a share of the size) and the plane that is best."""
+def _best_plane(body: Mesh, sample: np.ndarray) -> tuple[float, MirrorPlane]:
+    """Find the best mirror plane; return the distance of the mirror image, as a share of the size, and the plane."""
     size = _size(body)
-    x, normals = body.vertices[few], body.vertex_normals[few]
+    x, normals = body.vertices[sample], body.vertex_normals[sample]
     target = OrientedPoints(x, normals, NORMAL_WEIGHT * size)
     centre = np.average(body.corners.mean(axis=1), axis=0, weights=body.face_areas)
     axes = np.linalg.eigh(np.cov(x.T))[1].T
-    axes[(((x - centre) @ axes.T)**3).sum(axis=0) < 0] *= -1                # the same whichever way the body is turned
+    axes[(((x - centre) @ axes.T)**3).sum(axis=0) < 0] *= -1            # signs that do not depend on orientation
 
     def fitted(plane: MirrorPlane, rounds: int) -> tuple[float, MirrorPlane]:
         before = np.zeros(0)
@@ -118,6 +120,7 @@ def _best_plane(body: Mesh, few: np.ndarray) -> tuple[float, MirrorPlane]:
     k = np.arange(60)                                            # directions spread evenly over half the sphere
     z, angle = (k + 0.5) / len(k), k * np.pi * (3 - np.sqrt(5))
     r = np.sqrt(1 - z**2)
+    # score 60 directions and the principal axes, then refine the five best like ICP
     around = np.stack([r * np.cos(angle), r * np.sin(angle), z], axis=1)
     rough = [fitted(MirrorPlane(normal, centre), 0) for normal in np.vstack([axes, around @ axes])]
     rough.sort(key=lambda found: found[0])
@@ -125,11 +128,12 @@ def _best_plane(body: Mesh, few: np.ndarray) -> tuple[float, MirrorPlane]:
 
 
 def _size(body: Mesh) -> float:
-    """Twice the distance of the farthest vertex from the middle, metres."""
+    """Return twice the distance of the farthest vertex from the centroid, metres."""
     return 2 * float(np.linalg.norm(body.vertices - body.vertices.mean(axis=0), axis=1).max())
 
 
 def _mirror(normals: np.ndarray, plane: MirrorPlane) -> np.ndarray:
+    """Mirror directions (n, 3)."""
     return MirrorPlane(plane.normal, np.zeros(3)).reflect(normals)
 
 
@@ -141,6 +145,7 @@ def _match(body: Mesh, plane: MirrorPlane, pose: int) -> Symmetry:
     graph = body.vertex_adjacency
     laplacian = diags_array(np.asarray(graph.sum(axis=1)).ravel()) - graph
     image, inside_out = start, body.faces[:, ::-1]
+    # Laplacian-regularised warp from stiff to soft; matches beyond 3% of the size count less
     for stiffness in (300.0, 100.0, 30.0, 10.0, 3.0):
         normals = Mesh(image, inside_out).vertex_normals
         match = target.match(image, normals)
@@ -152,26 +157,28 @@ def _match(body: Mesh, plane: MirrorPlane, pose: int) -> Symmetry:
 
 
 def _pair(body: Mesh, start: np.ndarray, image: np.ndarray, plane: MirrorPlane, pose: int) -> Symmetry:
-    """Pair triangles by the warped mirror image (N, 3) of the body, which began at `start` (N, 3)."""
+    """Pair triangles by the warped mirror image (N, 3) of the body; `start` (N, 3) is the image before the warp."""
     size, normal = _size(body), plane.normal
     centres, areas, normals = body.corners.mean(axis=1), body.face_areas, body.face_normals
-    seen, seen_normals = image[body.faces].mean(axis=1), Mesh(image, body.faces[:, ::-1]).face_normals
+    image_centres, image_normals = image[body.faces].mean(axis=1), Mesh(image, body.faces[:, ::-1]).face_normals
 
     def nearest(among: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         target = OrientedPoints(centres[among], normals[among], NORMAL_WEIGHT * size)
-        match = target.match(seen[faces], seen_normals[faces], min_cosine=-1.0)
+        match = target.match(image_centres[faces], image_normals[faces], min_cosine=-1.0)
         return among[match.index], match.distances
 
     everything = np.arange(len(areas))
     partner, apart = nearest(everything, everything)
     across = (centres - centres[partner]) @ normal
-    if areas[across > 0].sum() < areas[across < 0].sum():        # so that it does not matter how the body is turned
+    if areas[across > 0].sum() < areas[across < 0].sum():        # so that the result does not depend on orientation
         normal, across = -normal, -across
+    # two connected sides; each triangle of one side is paired with one of the other
     left = keep_connected(np.zeros((len(areas), 2)), body.face_pairs, areas, (across > 0).astype(np.int64)) == 1
     sides = np.flatnonzero(left), np.flatnonzero(~left)
     for here, there in (sides, sides[::-1]):                     # a partner lies on the other side
         if len(here) and len(there):
             partner[here] = nearest(there, here)[0]
+    # quality: how much returns within 2% of the size, and how far the image was from the body
     back = np.linalg.norm(centres[partner[partner]] - centres, axis=1) < 0.02 * size
     moved = np.average(((start - image)**2).sum(axis=1), weights=body.vertex_areas)
     distance = np.sqrt(moved + np.average(apart**2, weights=areas)) / size

@@ -11,12 +11,14 @@ from scipy.sparse import coo_array, csr_array
 from ..geometry import rotations, storage
 from ..geometry.mesh import Mesh
 
-VERSION = 1
+VERSION = 1              # of the file format
 
 
 @dataclass(frozen=True, eq=False)
 class Skeleton:
     """Rigid parts of a template and the tree that links them.
+
+    All arrays are read-only.
 
     Parameters
     ----------
@@ -25,14 +27,21 @@ class Skeleton:
     parents : (J,) int
         Parent before child; part 0 is the root and its own parent is -1.
     joints : (J, 3) float, metres
-        Where part j is linked to its parent, on the template; `joints[0]` is the centroid of the vertices
-        of part 0.
-    names : J strings, optional
+        Position on the template where part j is linked to its parent. `joints[0]` is the centroid of the vertices of
+        part 0.
+    names : tuple of J str, optional
+        Different names of the parts; by default part0, part1, ...
 
     Raises
     ------
     ValueError
         Not a tree with parents first, an empty part, or shapes that do not agree.
+
+    Examples
+    --------
+    >>> skeleton = Skeleton([0, 0, 1], parents=[-1, 0], joints=[[0, 0, 0], [0, 0, 1]], names=("trunk", "head"))
+    >>> skeleton.part_rotations(np.zeros((2, 3))).shape
+    (2, 3, 3)
     """
 
     part_of_face: np.ndarray
@@ -51,6 +60,7 @@ class Skeleton:
             raise ValueError("joints: expected finite numbers")
         if not J or parents[0] != -1:
             raise ValueError("parents: expected part 0 to be the root, with parent -1")
+        # a parent must come before its children
         wrong = np.flatnonzero((parents[1:] < 0) | (parents[1:] >= np.arange(1, J))) + 1
         if len(wrong):
             raise ValueError(f"parents: part {wrong[0]} has parent {parents[wrong[0]]}, "
@@ -58,6 +68,7 @@ class Skeleton:
         if part_of_face.ndim != 1 or set(np.unique(part_of_face)) != set(range(J)):
             raise ValueError(f"part_of_face: expected every part of 0..{J - 1} to have triangles, "
                              f"found {np.unique(part_of_face).tolist()}")
+        # store read-only copies
         names = tuple(self.names) or tuple(f"part{j}" for j in range(J))
         if len(names) != J or len(set(names)) != J or not all(isinstance(name, str) for name in names):
             raise ValueError(f"names: expected {J} different names, got {list(names)}")
@@ -71,19 +82,19 @@ class Skeleton:
 
     @cached_property
     def joints_of_part(self) -> tuple[tuple[int, ...], ...]:
-        """For each part the joints on it: its own (unless it is the root) and those of its children."""
+        """The joints of each part: its own (unless it is the root) and those of its children."""
         return tuple(tuple(j for j in range(1, len(self.parents)) if j == p or self.parents[j] == p)
                      for p in range(len(self.parents)))
 
     @cached_property
     def depths(self) -> list[np.ndarray]:
-        """The parts by how many others are above them: the root, those that hang on it, and so on."""
+        """The parts by depth in the tree: the root, its children, and so on."""
         depth = self.descends.sum(axis=1) - 1
         return [np.flatnonzero(depth == d) for d in range(depth.max() + 1)]
 
     @cached_property
     def descends(self) -> np.ndarray:
-        """(J, J) bool: [p, j] is true where part p is j or hangs below it."""
+        """(J, J) bool: [p, j] is true where part p is j or a descendant of it."""
         J = len(self.parents)
         below = np.eye(J, dtype=bool)
         for p in range(1, J):
@@ -91,14 +102,14 @@ class Skeleton:
         return below
 
     def part_of_vertex(self, mesh: Mesh) -> np.ndarray:
-        """(N,) the part of most triangles around each vertex, the lowest number where they tie."""
+        """Return the part (N,) of most triangles around each vertex; ties go to the lowest number."""
         votes = np.zeros((len(mesh.vertices), len(self.parents)), dtype=np.int64)
         for corner in range(3):
             np.add.at(votes, (mesh.faces[:, corner], self.part_of_face), 1)
         return votes.argmax(axis=1)
 
     def ring(self, mesh: Mesh, j: int, widen: int = 0) -> np.ndarray:
-        """Vertices where part j meets its parent, and those within `widen` edges of them."""
+        """Return the vertices (n,) where part j meets its parent, and those within `widen` edges of them."""
         touches = np.zeros((len(mesh.vertices), 2), dtype=bool)
         for side, part in enumerate((j, self.parents[j])):
             touches[mesh.faces[self.part_of_face == part].ravel(), side] = True
@@ -108,11 +119,10 @@ class Skeleton:
         return np.flatnonzero(ring)
 
     def joint_regressor(self, template: Mesh) -> csr_array:
-        """(J, N) weights, each row summing to 1, with `regressor @ template.vertices == joints`.
+        """Build sparse weights (J, N), each row summing to 1, with `regressor @ template.vertices == joints`.
 
-        A joint is a fixed affine combination of the vertices around the ring where the parts meet (for
-        the root: the mean of its vertices), so on any posed or reshaped body `regressor @ vertices` are
-        its joints.
+        A joint is a fixed affine combination of the vertices around the ring where the parts meet, for the root the
+        mean of its vertices. So `regressor @ vertices` are the joints of any posed or reshaped body.
         """
         rings, values = zip(*(self.joint_weights(template, j) for j in range(len(self.parents))), strict=True)
         rows = np.repeat(np.arange(len(rings)), [len(r) for r in rings])
@@ -120,7 +130,7 @@ class Skeleton:
                                    shape=(len(rings), len(template.vertices))))
 
     def joint_weights(self, template: Mesh, j: int) -> tuple[np.ndarray, np.ndarray]:
-        """The vertices around joint j and their weights: one row of `joint_regressor`."""
+        """Return the vertices around joint j and their weights: one row of `joint_regressor`."""
         if j == 0:
             ring = np.flatnonzero(self.part_of_vertex(template) == 0)
         else:
@@ -130,7 +140,7 @@ class Skeleton:
         return ring, affine_weights(template.vertices[ring], self.joints[j])
 
     def part_rotations(self, pose: np.ndarray) -> np.ndarray:
-        """World rotations (..., J, 3, 3) of the parts for poses (..., J, 3), radians.
+        """Compute world rotations (..., J, 3, 3) of the parts for poses (..., J, 3), radians.
 
         `R_j = R_parent(j) exp(pose_j)`, `R_0 = exp(pose_0)`.
         """
@@ -140,37 +150,37 @@ class Skeleton:
         return R
 
     def pose_of(self, R: np.ndarray) -> np.ndarray:
-        """The poses (..., J, 3), radians, of part rotations (..., J, 3, 3): the inverse of `part_rotations`."""
+        """Compute poses (..., J, 3), radians, from part rotations (..., J, 3, 3): the inverse of `part_rotations`."""
         relative = R.copy()
         child = np.arange(1, len(self.parents))
         relative[..., 1:, :, :] = np.swapaxes(R[..., self.parents[child], :, :], -1, -2) @ R[..., 1:, :, :]
         return rotations.log(relative)
 
     def fit_rotations(self, template: Mesh, vertices: np.ndarray) -> np.ndarray:
-        """The rotation of every part (..., J, 3, 3) that best carries the template onto (..., N, 3)."""
+        """Fit the rotation of every part (..., J, 3, 3) from the template to vertices (..., N, 3), by Procrustes."""
         R = np.empty((*vertices.shape[:-2], len(self.parents), 3, 3))
         for p in range(len(self.parents)):
-            mine = np.unique(template.faces[self.part_of_face == p])
+            own = np.unique(template.faces[self.part_of_face == p])
             R[..., p, :, :] = rotations.procrustes(
-                np.broadcast_to(template.vertices[mine], (*vertices.shape[:-2], len(mine), 3)),
-                vertices[..., mine, :])[0]
+                np.broadcast_to(template.vertices[own], (*vertices.shape[:-2], len(own), 3)),
+                vertices[..., own, :])[0]
         return R
 
     def with_root_centred(self, template: Mesh) -> Skeleton:
-        """The same with `joints[0]` at the centroid of the vertices of part 0."""
+        """Return the skeleton with `joints[0]` at the centroid of the vertices of part 0."""
         joints = self.joints.copy()
         joints[0] = template.vertices[self.part_of_vertex(template) == 0].mean(axis=0)
         return Skeleton(self.part_of_face, self.parents, joints, self.names)
 
     def save(self, path: str | Path) -> None:
-        """Write as JSON."""
+        """Write the skeleton as JSON."""
         storage.write_json(path, {
             "kind": "skeleton", "version": VERSION, "names": list(self.names), "parents": self.parents.tolist(),
             "joints": self.joints.tolist(), "part_of_face": self.part_of_face.tolist()})
 
     @staticmethod
     def load(path: str | Path) -> Skeleton:
-        """Read a file of `save`."""
+        """Read a skeleton from a file of `save`; StorageError for anything else."""
         stored = storage.read_json(path, "a skeleton")
         if not isinstance(stored, dict) or stored.get("kind") != "skeleton":
             raise storage.StorageError(f"{path}: expected a skeleton in JSON, found something else")
@@ -182,9 +192,10 @@ class Skeleton:
 
 
 def affine_weights(points: np.ndarray, target: np.ndarray) -> np.ndarray:
-    """Weights nearest to equal that sum to 1 and average `points` (n, 3) to `target`."""
+    """Compute weights (n,) nearest to equal that sum to 1 and average `points` (n, 3) to `target` (3,)."""
     n = len(points)
     scale = np.linalg.norm(points - points.mean(axis=0), axis=1).mean()
+    # least change from equal weights, subject to sum 1 and the weighted mean at the target
     A = np.vstack([np.ones(n), (points - points.mean(axis=0)).T / scale])
     b = np.r_[1.0, (target - points.mean(axis=0)) / scale]
     start = np.full(n, 1 / n)
@@ -192,7 +203,7 @@ def affine_weights(points: np.ndarray, target: np.ndarray) -> np.ndarray:
 
 
 def reorder(part_of_face: np.ndarray, links: np.ndarray, root: int) -> np.ndarray:
-    """Order of the parts (old numbers), linked (J - 1, 2), that puts `root` first and parents before their children."""
+    """Order parts (old numbers) with `root` first, parents before children, larger ones first; links are (J - 1, 2)."""
     size = np.bincount(part_of_face)
     order, seen = [root], {root}
     for part in order:

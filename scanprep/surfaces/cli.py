@@ -66,6 +66,7 @@ def template(scans: ScansArg, output: Output, faces: Faces = 14000, landmarks: P
         raise ValueError("SCAN: expected a scan of the whole body, or views of it, got none")
     notes: tuple[str, ...] = ()
     rows, doubts, marks = list[Metric](), list[str](), dict[str, int]()
+    # views with known cameras are merged; anything else is aligned, meshed or taken as it is
     if len(scans) == 1 and (scans[0] / "cameras.json").exists():
         seen = _read_views(scans[0], unit)
         with bar("making the template") as progress:
@@ -74,7 +75,7 @@ def template(scans: ScansArg, output: Output, faces: Faces = 14000, landmarks: P
     else:
         paths = [path for given in scans for path in ([given] if not given.is_dir() else list_files(
             given, lambda path: is_scan(path) and ".landmarks." not in path.name, "views, meshes or point clouds"))]
-        # meshing points wants their normals
+        # meshing point clouds needs their normals
         views = [found if isinstance(found := read_scan(path, unit), Mesh) else read_points(path, unit)
                  for path in paths]
         scan = views[0] if len(views) == 1 else views_without_cameras(views)
@@ -121,7 +122,7 @@ def repair_mesh(mesh: MeshArg, output: Output, unit: Unit | None = None) -> Outc
 
 
 def _manifold(mesh: Mesh, path: Path) -> Mesh:
-    """The mesh, repaired first where it is not manifold, which is said."""
+    """Return the mesh, repaired and reported if it is not manifold."""
     if mesh.is_edge_manifold and mesh.is_vertex_manifold:
         return mesh
     mended = repair(mesh, 0.0)
@@ -151,7 +152,7 @@ def clean(scan: ScanArg, output: Output, landmarks: Path | None = None, unit: Un
         write_mesh(output, found.scan)
     else:
         write_points(output, PointCloud(found.scan, None, None))
-    pieces: dict[str, list[int]] = {}                       # one row for a reason: a noisy cloud has hundreds of pieces
+    pieces: dict[str, list[int]] = {}                       # one row per reason: a noisy cloud has hundreds of pieces
     for piece in found.components:
         pieces.setdefault(f"{'kept' if piece.kept else 'dropped'}: {piece.reason}", []).append(piece.points)
     return Outcome(output, [
@@ -267,6 +268,7 @@ def reduce(mesh: MeshArg, output: Output, faces: Faces, landmarks: Path | None =
         config: Settings for a mesh.
         of_set: Settings for a set.
     """
+    # a registered set: all meshes by one map
     if mesh.is_dir():
         wrong = [name for name, given in (("landmarks", landmarks), ("unit", unit),
                                           ("method", config.method != DecimateConfig().method)) if given]
@@ -291,17 +293,17 @@ def reduce(mesh: MeshArg, output: Output, faces: Faces, landmarks: Path | None =
 
 
 def _as_template(mesh: Mesh) -> Judgement:
-    """Whether a mesh can be brought onto scans."""
+    """Judge whether a mesh can serve as a template."""
     problem = template_problem(mesh)
     return Judgement.of(check=[] if problem is None else [f"not usable as a template: {problem}"])
 
 
 def _read_views(folder: Path, unit: Unit | None) -> list[tuple[Mesh, np.ndarray]]:
-    """The range meshes of a folder with the positions of their cameras."""
-    given = folder / "cameras.json"
-    where = storage.read_json(given, "camera positions {name: [x, y, z]}")
+    """Read the range meshes of a folder with the positions (3,), metres, of their cameras."""
+    cameras = folder / "cameras.json"
+    where = storage.read_json(cameras, "camera positions {name: [x, y, z]}")
     paths = list_meshes(folder)
-    with storage.taking_apart(given, "camera positions {name: [x, y, z]} in JSON"):
+    with storage.taking_apart(cameras, "camera positions {name: [x, y, z]} in JSON"):
         missing = [name_of(path) for path in paths if name_of(path) not in where]
         if missing:
             raise ValueError(f"none for {', '.join(missing)}")

@@ -1,4 +1,4 @@
-"""Point clouds made meshes: what a scanner without triangles gives, for everything that needs a surface."""
+"""Turn point clouds into meshes, for everything that needs a surface."""
 from __future__ import annotations
 
 import warnings
@@ -11,20 +11,19 @@ from ..geometry.files import PointCloud, read_points, read_scan
 from ..geometry.mesh import Mesh
 from ..repair.manifold import repair
 
-MOST = 40_000                          # points that are meshed: 7 mm apart on a person, as the triangles of a template
-AWAY = 2.5                             # metres from which cameras look at people
+MOST = 40_000                          # points to mesh: 7 mm apart on a person, like the triangles of a template
+AWAY = 2.5                             # metres: usual distance of a camera from a person
 
 
 def mesh_of_cloud(cloud: PointCloud | np.ndarray) -> Mesh:
-    """The surface through the points of a whole body; open where nothing was scanned.
+    """Mesh the points of a whole body; the surface is open where nothing was scanned.
 
-    By screened Poisson reconstruction; what lies farther from the points than their spacing lets expect is trimmed
-    off.
+    Screened Poisson reconstruction; surface far from any point is removed.
 
     Parameters
     ----------
     cloud : PointCloud or (n, 3) float, metres
-        Normals are taken where there are any, else estimated.
+        Normals are used if there are any, else estimated.
 
     Returns
     -------
@@ -36,7 +35,7 @@ def mesh_of_cloud(cloud: PointCloud | np.ndarray) -> Mesh:
     ValueError
         Too few points, or points with no surface between them.
     MissingLibrary
-        open3d, or the system's libraries it stands on.
+        Open3D, or a system library it needs.
     """
     from ..adapters.open3d_filters import estimate_oriented_normals, reconstruct_screened_poisson
 
@@ -45,10 +44,11 @@ def mesh_of_cloud(cloud: PointCloud | np.ndarray) -> Mesh:
     surface = reconstruct_screened_poisson(points, estimate_oriented_normals(points) if normals is None else normals,
                                            spacing)
     away = cKDTree(points).query(surface.vertices)[0]
-    # spacings from the nearest point, beyond which nothing was measured
+    # farther than 2.5 spacings from every point nothing was measured
     surface = surface.submesh((away <= 2.5 * spacing)[surface.faces].all(axis=1))[0]
     if not len(surface.faces):
         raise ValueError("cloud: no surface lies between its points; are they of a surface?")
+    # drop specks, and make the volume positive: normals outward
     surface = repair(surface, 0.02)
     if surface.with_vertices(surface.vertices - np.median(surface.vertices, axis=0)).volume < 0:
         surface = Mesh(surface.vertices, np.ascontiguousarray(surface.faces[:, ::-1]))
@@ -56,10 +56,10 @@ def mesh_of_cloud(cloud: PointCloud | np.ndarray) -> Mesh:
 
 
 def read_sound_surface(path: Path, unit: str | None = None) -> Mesh:
-    """The mesh of a scan, made sound; of a file without triangles the surface through its points, with a warning."""
-    found = read_scan(path, unit)
-    if isinstance(found, Mesh):
-        return found
+    """Read the mesh of a scan; mesh the points of a file without triangles, with a warning."""
+    scan = read_scan(path, unit)
+    if isinstance(scan, Mesh):
+        return scan
     warnings.warn(f"{path} has no triangles: its points are meshed, and left open where there are none", stacklevel=2)
     try:
         return mesh_of_cloud(read_points(path, unit))
@@ -68,23 +68,22 @@ def read_sound_surface(path: Path, unit: str | None = None) -> Mesh:
 
 
 def mesh_of_view(view: PointCloud | np.ndarray) -> tuple[Mesh, np.ndarray]:
-    """The surface that one camera saw as points, by rolling balls over them, and about where the camera was (3,).
+    """Mesh the points that one camera saw, by ball pivoting; estimate the camera's position (3,), metres.
 
-    All normals face the camera. On people they lie around the direction to it, so their mean is that direction, and
-    what they enclose is behind them. The camera is taken to be 2.5 m away.
+    All normals face the camera, and on people their mean is the direction to it. The camera is assumed 2.5 m away.
     """
     from ..adapters.open3d_filters import ball_pivoting, estimate_oriented_normals
 
     points, normals = _thin(view)
     if normals is None:
         normals = estimate_oriented_normals(points)
-        # from the axis along which normals are longest to the direction around which they lie
+        # direction to the camera: start with the main axis of the normals, then alternate signs and mean
         ahead = np.linalg.eigh(normals.T @ normals)[1][:, -1]
         for _ in range(10):
             normals *= np.where(normals @ ahead < 0, -1.0, 1.0)[:, None]
             ahead = normals.mean(axis=0) / np.linalg.norm(normals.mean(axis=0))
         middle = points - points.mean(axis=0)
-        if np.einsum("nd,nd->", middle, normals) < 0:                 # the shell would be hollow towards the camera
+        if np.einsum("nd,nd->", middle, normals) < 0:             # else it would be concave towards the camera
             normals = -normals
     mesh = repair(ball_pivoting(points, normals, spacing_of(points)), 0.02)
     ahead = mesh.vertex_normals.mean(axis=0)
@@ -92,20 +91,20 @@ def mesh_of_view(view: PointCloud | np.ndarray) -> tuple[Mesh, np.ndarray]:
 
 
 def spacing_of(points: np.ndarray) -> float:
-    """How far apart the points (n, 3) of a surface are, metres: the root of the area that each has to itself.
+    """Estimate the spacing of points (n, 3) of a surface, metres: the root of the area per point.
 
-    From the distance to the sixth neighbour, which noise and pairs of overlapping views hardly change.
+    From the distance to the sixth neighbour, which noise and overlapping views hardly change.
     """
-    few = points[np.random.default_rng(0).permutation(len(points))[:4000]]
-    return float(np.sqrt(np.pi / 6) * np.median(cKDTree(points).query(few, 7)[0][:, 6]))
+    sample = points[np.random.default_rng(0).permutation(len(points))[:4000]]
+    return float(np.sqrt(np.pi / 6) * np.median(cKDTree(points).query(sample, 7)[0][:, 6]))
 
 
 def _thin(cloud: PointCloud | np.ndarray) -> tuple[np.ndarray, np.ndarray | None]:
-    """Points at different places, so many as a template needs, and their normals if they have any."""
+    """Choose distinct points, as many as a template needs, with their normals if they have any."""
     points = cloud.points if isinstance(cloud, PointCloud) else np.asarray(cloud, dtype=np.float64)
     normals = cloud.normals if isinstance(cloud, PointCloud) else None
     rows = np.unique(points, axis=0, return_index=True)[1]
-    least = 100  # points of anything that has a surface
+    least = 100  # fewer points do not make a surface
     if len(rows) < least:
         raise ValueError(f"cloud: expected at least {least} points at different places, got {len(rows)}")
     rows = np.random.default_rng(0).permutation(rows)[:MOST]

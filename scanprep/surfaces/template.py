@@ -1,4 +1,4 @@
-"""From one scan of a subject, or range views, to the template of all registrations."""
+"""Make the template of all registrations from one scan of a subject, or from range views."""
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
@@ -34,9 +34,9 @@ class TemplateConfig(Settings):
     fill : FillConfig
     decimate : DecimateConfig
     smoothing : int
-        Rounds of smoothing, once before the holes are filled and once after.
+        Rounds of smoothing, before and again after holes are filled.
     thinnest : float, metres
-        What is thinner, as fingers are that were hardly seen, is taken off.
+        Thinner parts, such as poorly seen fingers, are removed.
     """
 
     merge: MergeConfig = field(default_factory=lambda: MergeConfig(voxel=0.004, truncation=2.0, min_cosine=0.15))
@@ -48,10 +48,10 @@ class TemplateConfig(Settings):
 
 def make_template(views: Sequence[Any], faces: int = 14000, config: TemplateConfig | None = None,
                   progress: Callable[[int, int], None] | None = None) -> Mesh:
-    """Range views of one subject to a closed manifold mesh: merge, repair, smooth, fill, decimate.
+    """Make a closed manifold mesh from range views of one subject: merge, repair, smooth, fill, decimate.
 
-    Views are RangeViews or pairs of a Mesh and a camera position (3,). ValueError where they give no surface that can
-    serve as a template.
+    Views are RangeViews or pairs of a Mesh and a camera position (3,). ValueError if the result cannot serve as a
+    template.
     """
     config = config or TemplateConfig()
     return _finish(merge_views(views, config.merge), faces, config, progress, "the merged views").mesh
@@ -59,18 +59,17 @@ def make_template(views: Sequence[Any], faces: int = 14000, config: TemplateConf
 
 @dataclass(frozen=True, eq=False)
 class MadeTemplate:
-    """A template, and what was done to the scan that it was made of."""
+    """A template, with a report of how it was made."""
 
     mesh: Mesh
     notes: tuple[str, ...]              # one sentence each
-    filled: float                       # share of the surface that lies where nothing was scanned
-    handles: int                        # where the surface is joined to itself, as between thighs that touch
-    balance: float | None               # share of the triangles on the left of the body; None where it has no sides
+    filled: float                       # share of the surface without scan data
+    handles: int                        # topological handles, as between thighs that touch
+    balance: float | None               # share of the triangles on the left side; None without symmetry
 
     @property
     def doubts(self) -> list[str]:
-        """What somebody should look at before scans are registered with it."""
-        # of a surface, beyond which its shape is half a guess
+        """What needs a look before scans are registered with it: more than 5% filled, or handles."""
         return [*([f"{100 * self.filled:.0f}% of the surface is filled, nothing was scanned there"]
                   if self.filled > 0.05 else []),
                 *([f"the surface is joined to itself in {number_of(self.handles, 'place')}: thighs, armpits or "
@@ -81,24 +80,29 @@ class MadeTemplate:
 def template_of_scan(scan: Mesh | PointCloud, faces: int = 14000, config: TemplateConfig | None = None,
                      landmarks: np.ndarray | None = None, progress: Callable[[int, int], None] | None = None
                      ) -> MadeTemplate:
-    """One scan of a whole body to a closed manifold mesh: the body alone, repaired, filled, decimated.
+    """Make a closed manifold mesh from one scan of a whole body: clean, repair, fill, decimate.
 
     Parameters
     ----------
     scan : Mesh or PointCloud, metres
-        Points, and meshes in which several views lie over each other, are meshed anew.
+        Points, and meshes with overlapping views, are meshed anew.
     faces : int
         Triangles of the template.
     config : TemplateConfig, optional
+        Settings.
     landmarks : (L, 3) float, metres, optional
-        Points on the body, where it is not the largest thing in the scan.
+        Points on the body, if it is not the largest piece of the scan.
     progress : callable, optional
-        Called with (done, total).
+        Called as progress(done, total).
+
+    Returns
+    -------
+    MadeTemplate
 
     Raises
     ------
     ValueError
-        Nothing that can serve as a template is left.
+        The result cannot serve as a template.
 
     [Liepa] hole filling; [QEM] pair contraction
     """
@@ -109,7 +113,7 @@ def template_of_scan(scan: Mesh | PointCloud, faces: int = 14000, config: Templa
     if isinstance(scan, Mesh):
         body = scan.submesh(kept[scan.faces].all(axis=1))[0]
         mesh = repair(body)
-        # of the surface of a body that is one mesh hangs together
+        # in a single mesh at least 0.9 of the surface is connected; overlapping views are meshed anew
         if mesh.face_areas.sum() < 0.9 * body.face_areas.sum():
             notes.append("its pieces lie side by side or over each other: their points were meshed anew")
             mesh = mesh_of_cloud(PointCloud(body.vertices, body.vertex_normals))
@@ -124,10 +128,10 @@ def template_of_scan(scan: Mesh | PointCloud, faces: int = 14000, config: Templa
 
 
 def views_without_cameras(views: Sequence[Mesh | PointCloud]) -> PointCloud:
-    """Range views of which nobody knows the cameras, aligned: their points and normals, as one cloud.
+    """Align range views without known cameras; return their points and normals as one cloud.
 
-    They are a few centimetres and degrees from where they belong, or anywhere, then they are placed by their shapes
-    first. ValueError for a view that shares too little with the others.
+    Views within a few centimetres and degrees of their true poses are aligned directly, others first by shape.
+    ValueError for a view that overlaps too little with the others.
     """
     placed = []
     for view in views:
@@ -136,29 +140,29 @@ def views_without_cameras(views: Sequence[Mesh | PointCloud]) -> PointCloud:
             placed.append((view, view.vertices.mean(axis=0) + AWAY * ahead / max(np.linalg.norm(ahead), 1e-12)))
         else:
             placed.append(mesh_of_view(view))
-    found = align_views(placed)
-    apart = found.overlap < AlignViewsConfig().min_overlap
+    aligned = align_views(placed)
+    apart = aligned.overlap < AlignViewsConfig().min_overlap
     if len(views) > 1 and apart.any():
-        found = align_views(placed, features=True)
-        apart = found.overlap < AlignViewsConfig().min_overlap
+        aligned = align_views(placed, features=True)
+        apart = aligned.overlap < AlignViewsConfig().min_overlap
     if len(views) > 1 and apart.any():
-        raise ValueError(f"view {int(apart.argmax()) + 1} shares {100 * found.overlap.min():.0f}% of its surface with "
-                         "the others; views need about a fifth in common: leave it out, or align the views first "
+        raise ValueError(f"view {int(apart.argmax()) + 1} shares {100 * aligned.overlap.min():.0f}% of its surface "
+                         "with the others; views need about a fifth in common: leave it out, or align the views first "
                          "(scape prep views, with landmarks)")
-    meshes = [mesh for mesh, _ in found.views]
+    meshes = [mesh for mesh, _ in aligned.views]
     return PointCloud(np.concatenate([mesh.vertices for mesh in meshes]),
                       np.concatenate([mesh.vertex_normals for mesh in meshes]))
 
 
 def _finish(mesh: Mesh, faces: int, config: TemplateConfig, progress: Callable[[int, int], None] | None, what: str,
             landmarks: np.ndarray | None = None) -> MadeTemplate:
-    """Smooth, fill and decimate an open surface; the vertices at landmarks (L, 3), such as fingertips, stay."""
+    """Smooth, fill and decimate an open surface; vertices at landmarks (L, 3), such as fingertips, stay."""
     tell, notes = progress or (lambda done, total: None), list[str]()
     tell(1, 4)
     mesh = repair(mesh)
-    # as wide as on merged views: on coarse scans as many rounds would round off fingers
+    # the same smoothing length as on merged views: on coarse scans as many rounds would round off fingers
     rounds = min(config.smoothing, round(config.smoothing * (config.merge.voxel / mesh.mean_edge)**2))
-    scanned = mesh = smooth_taubin(mesh, rounds)                        # smooth rims make fair patches
+    scanned = mesh = smooth_taubin(mesh, rounds)                        # smooth borders give fair patches
     holes = len(mesh.boundary_loops)
     if holes:
         notes.append(f"{number_of(holes, 'hole was', 'holes were')} filled")
@@ -172,25 +176,26 @@ def _finish(mesh: Mesh, faces: int, config: TemplateConfig, progress: Callable[[
     keep = None if landmarks is None else np.unique(cKDTree(mesh.vertices).query(landmarks)[1])
     small = _improve(decimate(mesh, faces, config.decimate, keep), surface, keep)
     balance = share_on_left(small)
-    # of all triangles that one side may have more of than its area lets expect
+    # one side may have at most 3% more of the triangles than its area suggests
     if balance is not None and abs(balance - 0.5) > 0.03:
-        # collapses of least error spend triangles on the noise of one side; those of shortest edges do not
+        # least-error collapses may spend triangles on the noise of one side; shortest-edge collapses do not
         small = _improve(decimate(mesh, faces, replace(config.decimate, method="even")), surface, keep)
         notes.append(f"{100 * balance:.0f}% of the triangles were on the left side; made even, "
                      f"{100 * (share_on_left(small) or 0.5):.0f}% are")
         balance = share_on_left(small)
-    if template_problem(small):                                  # a triangle that decimation left without area
+    if template_problem(small):                                  # decimation left a degenerate triangle
         small = close(small, config.fill)
     check_template(small, what)
     far = Surface(scanned).closest(small.corners.mean(axis=1)).distances > scanned.mean_edge
     tell(4, 4)
+    # genus by the Euler characteristic; triangles farther from the scan than its mean edge are filled
     handles = 1 - (len(small.vertices) - len(small.edges) + len(small.faces)) // 2
     return MadeTemplate(small, tuple(notes), float(small.face_areas[far].sum() / small.face_areas.sum()), handles,
                         balance)
 
 
 def _improve(mesh: Mesh, surface: Surface, keep: np.ndarray | None) -> Mesh:
-    """Well-shaped triangles; the vertices nearest to those of the surface `keep` (L,) are where these are."""
+    """Improve the shape of triangles; vertices `keep` (L,) of the surface stay vertices of the mesh."""
     if keep is None:
         return improve_triangles(mesh, surface)
     nearest, which = np.unique(cKDTree(mesh.vertices).query(surface.mesh.vertices[keep])[1], return_index=True)
@@ -200,20 +205,20 @@ def _improve(mesh: Mesh, surface: Surface, keep: np.ndarray | None) -> Mesh:
 
 
 def carry_landmarks(places: Mapping[str, np.ndarray], mesh: Mesh) -> tuple[dict[str, int], dict[str, float]]:
-    """The vertices of a mesh nearest to landmarks (3,), and the distances, metres, of those off its surface."""
+    """Find the vertices nearest to landmarks (3,), and the distances, metres, of landmarks off the surface."""
     if not places:
         return {}, {}
     points = np.array(list(places.values()))
     away, vertices = Surface(mesh).closest(points).distances, cKDTree(mesh.vertices).query(points)[1]
-    # metres from the template at which a landmark was clicked on something else
+    # a landmark more than 1 cm off was clicked on something else
     return (dict(zip(places, vertices.tolist(), strict=True)),
             {name: float(d) for name, d in zip(places, away, strict=True) if d > 0.01})
 
 
 def share_on_left(mesh: Mesh) -> float | None:
-    """The share of the triangles on one side of the body's plane of symmetry; None where it has none."""
-    found = find_symmetry(mesh)
-    if not found.holds or not found.two_sided:
+    """Compute the share of triangles on one side of the symmetry plane, corrected for area; None without symmetry."""
+    symmetry = find_symmetry(mesh)
+    if not symmetry.holds or not symmetry.two_sided:
         return None
-    by_area = float(mesh.face_areas[found.left].sum() / mesh.face_areas.sum())
-    return float(found.left.mean()) - by_area + 0.5              # a leg ahead, or a body turned, is no imbalance
+    by_area = float(mesh.face_areas[symmetry.left].sum() / mesh.face_areas.sum())
+    return float(symmetry.left.mean()) - by_area + 0.5              # by area, as poses are not symmetric

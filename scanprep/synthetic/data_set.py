@@ -1,4 +1,4 @@
-"""The synthetic data set: scans of one subject in many poses and of many subjects, truth kept beside them."""
+"""The synthetic data set: scans of one subject in many poses and of many subjects, with ground truth."""
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
@@ -14,28 +14,28 @@ from .landmarks import landmarks as landmark_vertices
 from .people import NAMED_POSES, BodyShape, SyntheticPerson, find_pose, mirror_synthetic_pose, random_pose
 from .scanner import RangeView, Scan, ScannerConfig, scan
 
-VERSION = 2                          # 1 was of people who were made up; their shapes mean nothing here
+VERSION = 2                          # version 1 had other people, whose betas mean nothing here
 
 
 @dataclass(frozen=True, eq=False)
 class GroundTruth:
-    """What really stood in the scanner; for evaluation, used by no stage."""
+    """What really stood in the scanner; for evaluation only, no stage uses it."""
 
     shape: BodyShape
     pose: np.ndarray  # (16, 3) float, radians
     trans: np.ndarray  # (3,) float, metres
-    vertices: np.ndarray  # (N, 3) float, metres: on the topology shared by all people
+    vertices: np.ndarray  # (N, 3) float, metres: in the topology shared by all people
     faces: np.ndarray  # (F, 3) int
     part_of_face: np.ndarray  # (F,) int
-    joints: np.ndarray  # (16, 3) float, metres: in the pose
+    joints: np.ndarray  # (16, 3) float, metres: in this pose
 
     @property
     def mesh(self) -> Mesh:
-        """The true surface."""
+        """Return the true surface."""
         return Mesh(self.vertices, self.faces)
 
     def save(self, path: str | Path) -> None:
-        """Write as .npz."""
+        """Write the truth as .npz."""
         arrays = {f.name: getattr(self, f.name) for f in fields(self) if f.name != "shape"}
         shape = {f.name: getattr(self.shape, f.name) for f in fields(self.shape)}
         storage.save(path, "ground truth", VERSION, arrays, {"shape": shape})
@@ -56,7 +56,7 @@ class GroundTruth:
 
 
 def stand(person: SyntheticPerson, pose: np.ndarray) -> GroundTruth:
-    """A person in a pose with the lowest point on the floor, z = 0."""
+    """Put a person into a pose with the lowest point on the floor, z = 0."""
     vertices = person.in_pose(pose)
     trans = np.array([0.0, 0.0, -vertices[:, 2].min()])
     return GroundTruth(person.shape, np.asarray(pose, dtype=np.float64), trans, vertices + trans, person.mesh.faces,
@@ -65,25 +65,26 @@ def stand(person: SyntheticPerson, pose: np.ndarray) -> GroundTruth:
 
 def click_landmarks(truth: GroundTruth, rng: np.random.Generator, error: float = 0.003,
                     seen: np.ndarray | None = None, reach: float = 0.012) -> dict[str, np.ndarray]:
-    """Landmarks as a person would click them on the scan, each coordinate off by `error`, metres.
+    """Simulate landmarks clicked by a person, each coordinate off by a normal error of `error` metres.
 
-    Those without a point of the scan, `seen` (n, 3), within `reach` are left out.
+    Landmarks without a point of the scan, `seen` (n, 3), within `reach` are left out.
     """
     names = landmark_vertices()
-    true = {name: truth.vertices[v] for name, v in names.items()}
+    points = {name: truth.vertices[v] for name, v in names.items()}
+    # noise for all landmarks in a fixed order, so that it does not depend on which are seen
     noise = {name: error * rng.normal(size=3) for name in names}
     if seen is not None:
-        distances, _ = cKDTree(seen).query(np.stack(list(true.values())))
-        true = {name: point for (name, point), d in zip(true.items(), distances, strict=True) if d < reach}
-    return {name: point + noise[name] for name, point in true.items()}
+        distances, _ = cKDTree(seen).query(np.stack(list(points.values())))
+        points = {name: point for (name, point), d in zip(points.items(), distances, strict=True) if d < reach}
+    return {name: point + noise[name] for name, point in points.items()}
 
 
 def write_scan(folder: str | Path, name: str, scanned: Scan, truth: GroundTruth | None = None,
                landmarks: dict[str, np.ndarray] | None = None, views: bool = True) -> Path:
-    """Store a scan: `name.ply` with all views' triangles, and beside it what is known.
+    """Write a scan: `name.ply` with the triangles of all views, and beside it what is known of it.
 
-    Landmarks go to `name.landmarks.json`, the views to `views/name.npz`, the truth to `truth/name.npz`. The
-    PLY is written last, so where it is, the rest is too.
+    Landmarks go to `name.landmarks.json`, the views to `views/name.npz`, the truth to `truth/name.npz`. The PLY is
+    written last: if it exists, the rest does too.
     """
     from ..geometry.files import write_mesh
 
@@ -102,6 +103,7 @@ def write_scan(folder: str | Path, name: str, scanned: Scan, truth: GroundTruth 
 
 
 def _write_views(path: Path, scanned: Scan) -> None:
+    """Write the views of a scan."""
     arrays = {}
     for k, view in enumerate(scanned.views):
         arrays.update({f"points{k}": view.points, f"faces{k}": view.mesh.faces, f"normals{k}": view.normals,
@@ -111,13 +113,14 @@ def _write_views(path: Path, scanned: Scan) -> None:
 
 
 def read_views(path: str | Path) -> list[RangeView]:
-    """The views of one scan, from `views/name.npz`."""
+    """Read the views of one scan, from `views/name.npz`."""
     header, a = storage.load(path, "range views", (VERSION,))
     with storage.taking_apart(path, "whole range views"):
         return [_view(a, k) for k in range(header["views"])]
 
 
 def _view(a: dict[str, np.ndarray], k: int) -> RangeView:
+    """Build view k from the arrays of a file."""
     mesh = Mesh(storage.numbers(a, f"points{k}", None, 3), storage.numbers(a, f"faces{k}", None, 3))
     T = storage.numbers(a, f"T_world_camera{k}", 4, 4)
     return RangeView(mesh, storage.numbers(a, f"normals{k}", len(mesh.vertices), 3), T[:3, 3], T,
@@ -137,39 +140,45 @@ class SyntheticScan:
 
     @property
     def path(self) -> Path:
-        """The mesh of all views."""
+        """Return the file of the mesh of all views."""
         return self.folder / f"{self.name}.ply"
 
     @property
     def landmarks(self) -> Path:
+        """Return the file of the landmarks."""
         return self.folder / f"{self.name}.landmarks.json"
 
     @property
     def views(self) -> Path:
+        """Return the file of the views."""
         return self.folder / "views" / f"{self.name}.npz"
 
     @property
     def truth(self) -> Path:
+        """Return the file of the ground truth."""
         return self.folder / "truth" / f"{self.name}.npz"
 
 
-WRIST, ANKLE = 0.6, 0.4                # radians by which hands and feet are held other than in named poses, at most
+WRIST, ANKLE = 0.6, 0.4                # radians: largest deviation of hands and feet from a named pose
+# the subject in many poses: a man a little taller and lighter than the average
 SUBJECT = BodyShape.like("male", stature=1.78, weight=-0.5)
 
 
 def scan_plan(subject_poses: int, subjects: int) -> list[tuple[int, bool]]:
-    """The scans of a data set: the number of each, and whether it is of the one subject."""
+    """List the scans of a data set: number, and whether it is of the one subject."""
     return [(k, True) for k in range(subject_poses)] + [(k, False) for k in range(subjects)]
 
 
 @lru_cache(maxsize=1)
 def _person(shape: BodyShape) -> SyntheticPerson:
+    """Return the person of a shape; the last one is kept, as building it takes long."""
     return SyntheticPerson(shape)
 
 
 def synthetic_scan(folder: Path, seed: int, k: int, is_pose: bool, config: ScannerConfig, click_error: float = 0.003
                   ) -> SyntheticScan:
-    """One scan of `scan_plan`, made unless its files are there."""
+    """Make one scan of `scan_plan`, unless its files exist."""
+    # a generator per scan: results do not depend on the order or on the number of scans
     rng = np.random.default_rng([seed, int(is_pose), k])
     if is_pose:
         label, pose = subject_pose(k, rng)
@@ -187,16 +196,17 @@ def synthetic_scan(folder: Path, seed: int, k: int, is_pose: bool, config: Scann
 
 
 def subject_pose(k: int, rng: np.random.Generator) -> tuple[str, np.ndarray]:
-    """The k-th pose (16, 3) of the subject: rest, then the named poses, then random ones, each a little loosened."""
+    """Return the k-th pose (16, 3) of the subject: rest, named poses, then random ones, each slightly varied."""
     if k == 0:
         return "rest", np.zeros((16, 3))
     order = [name for name in NAMED_POSES if name != "rest"]
-    step = 11                                     # spreads kinds of pose evenly over a short list
+    step = 11                                     # mixes kinds, which follow each other in the list
     if k <= len(order):
         name = order[(k * step) % len(order)]
         loose = 0.08 * rng.normal(size=(16, 3))
+        # pelvis, forearms and shins vary less: elbows and knees are hinges
         loose[[0, 5, 8, 11, 14]] *= 0.3
-        # hands and feet held in all ways, or none could tell where they begin
+        # hands and feet vary more, or the skeleton could not be found there
         loose[[6, 9]] = np.clip(4.5 * loose[[6, 9]], -WRIST, WRIST)
         loose[[12, 15]] = np.clip(3.0 * loose[[12, 15]], -ANKLE, ANKLE)
         pose = find_pose(name) + loose
@@ -205,9 +215,10 @@ def subject_pose(k: int, rng: np.random.Generator) -> tuple[str, np.ndarray]:
 
 
 def near_rest(rng: np.random.Generator) -> np.ndarray:
-    """A pose (16, 3) near rest, as people who are asked to stand still take it."""
+    """Return a pose (16, 3) near rest, like people who are asked to stand still."""
     loose = 0.05 * rng.normal(size=(16, 3))
     loose[0] *= 0.3
+    # elbows and knees only bend in their natural direction
     loose[[5, 8]] = np.abs(loose[[5, 8]]) * [[-1, 0, -1], [-1, 0, 1]]
     loose[[11, 14]] = np.abs(loose[[11, 14]]) * [1, 0, 0]
     return loose

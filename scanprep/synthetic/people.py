@@ -1,8 +1,8 @@
-"""Synthetic subjects: procedural people with a known shape, skeleton and pose.
+"""Synthetic people with known shape, skeleton and pose.
 
-z is up, a person faces -y, stands on z = 0 and has the left side at +x; at rest the arms hang about 36
-degrees away from the body. All people share one closed triangulation, and vertex i is the same anatomical
-place on everybody. Posing is no linear blend skinning: see `posing`.
+z is up. A person faces -y, stands on z = 0 and has the left side at +x; at rest the arms hang about 36 degrees away
+from the body. All people share one closed triangulation, and vertex i is the same anatomical place on everybody.
+Posing is not linear blend skinning: see `posing`.
 """
 from __future__ import annotations
 
@@ -26,8 +26,13 @@ __all__ = ["NAMED_POSES", "PARENTS", "PARTS", "BodyShape", "SyntheticPerson", "c
 class SyntheticPerson:
     """One person: the surface at rest, the skeleton, and the surface in any pose.
 
-    `mesh` is at rest, with `part_of_face` (F,) and `part_of_vertex` (N,); every part turns in its parent at the
-    `joints` (16, 3), metres, of which the first is the centroid of the vertices of part 0.
+    `mesh` is at rest, with `part_of_face` (F,) and `part_of_vertex` (N,). Every part turns about one of the `joints`
+    (16, 3), metres; the first is the centroid of the vertices of part 0.
+
+    Parameters
+    ----------
+    shape : BodyShape, optional
+        By default the average man.
     """
 
     parents = PARENTS
@@ -48,25 +53,26 @@ class SyntheticPerson:
 
     @cached_property
     def skeleton(self) -> Skeleton:
-        """The true parts, tree and joints."""
+        """Return the true parts, tree and joints."""
         return Skeleton(self.part_of_face, self.parents, self.joints, self.names)
 
     @cached_property
     def _poser(self) -> Poser:
+        """Return what posing needs; built when first used."""
         return Poser(self.anatomy, self.mesh.vertices, self.joints[0])
 
     def in_pose(self, pose: np.ndarray, trans: np.ndarray | None = None) -> np.ndarray:
-        """The vertices (N, 3), metres, in a pose (16, 3): rotation vectors of the parts against their parents.
+        """Compute the vertices (N, 3), metres, in a pose (16, 3): axis-angle of each part relative to its parent.
 
-        `pose[0]` turns the body about `joints[0]`.
+        `pose[0]` turns the body about `joints[0]`. Adds `trans` (3,), metres.
         """
         pose = _check(pose)
         return self._poser(pose) + (0 if trans is None else np.asarray(trans, dtype=np.float64))
 
     def joints_in_pose(self, pose: np.ndarray, trans: np.ndarray | None = None) -> np.ndarray:
-        """The joints (16, 3) in a pose, metres; shoulders move in the chest as the arms are raised.
+        """Compute the joints (16, 3), metres, in a pose; shoulders move in the chest as the arms are raised.
 
-        `posed_joints(pose)[0]` is `joints[0] + trans`.
+        The first one is always `joints[0] + trans`.
         """
         pose = _check(pose)
         joints = self._poser.part_motion(pose)[1] + self._poser.settling(pose)
@@ -74,11 +80,12 @@ class SyntheticPerson:
         return joints + (0 if trans is None else np.asarray(trans, dtype=np.float64))
 
     def part_rotations(self, pose: np.ndarray) -> np.ndarray:
-        """World rotations (16, 3, 3) of the parts in a pose."""
+        """Compute the world rotations (16, 3, 3) of the parts in a pose."""
         return self._poser.part_motion(_check(pose))[0]
 
 
 def _check(pose: np.ndarray) -> np.ndarray:
+    """Return a pose as floats; ValueError for anything but finite (16, 3)."""
     pose = np.asarray(pose, dtype=np.float64)
     if pose.shape != (len(PARTS), 3) or not np.isfinite(pose).all():
         raise ValueError(f"pose: expected finite rotation vectors ({len(PARTS)}, 3), got shape {pose.shape}")
@@ -86,7 +93,7 @@ def _check(pose: np.ndarray) -> np.ndarray:
 
 
 def __getattr__(name: str) -> dict[str, int]:
-    """LANDMARKS and MARKERS, name -> vertex on the shared topology, built when first asked for."""
+    """Return LANDMARKS or MARKERS, name -> vertex of the shared topology, built when first used."""
     if name == "LANDMARKS":
         return landmarks()
     if name == "MARKERS":

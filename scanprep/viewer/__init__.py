@@ -1,8 +1,8 @@
-"""Bodies in a browser: the server of this machine that a page talks to, and what they say to each other.
+"""Bodies in a browser: a local server, the page that talks to it, and the messages between them.
 
-    server      one server per command: its address, its thread, its end;  worker  one job after another, off the loop
-    handlers    page, socket, uploads and downloads;  gate  who may ask for them, and what is refused in one line
-    tabs        what each open tab is still to be told;  waiting  messages in order, the newest of its kind
-    pages       an app inside of which others are opened, on the same server;  dropped  files kept while it runs
+    server      one server per command: address, thread, end;  worker  runs one job after another, off the event loop
+    handlers    page, socket, uploads and downloads;  gate  who may ask for them; refusals in one line
+    tabs        messages that each open tab still has to get;  waiting  messages in order, the newest of its kind
+    pages       an app that opens other apps on the same server;  dropped  files dropped on the page
     messages    one message as bytes, as `source/connection.js` reads and writes them
 """

@@ -1,4 +1,4 @@
-"""What the server answers: the page, its socket, files dropped on it and files taken from it."""
+"""Request handlers of the server: the page, its socket, uploads of dropped files, downloads."""
 from __future__ import annotations
 
 import contextlib
@@ -22,15 +22,16 @@ from .messages import Message
 from .served_page import HEADERS, NOTHING, page, policy
 from .tabs import Tab, Tabs
 
-LARGEST_MESSAGE = 2**24              # bytes
-LARGEST_FILE = 2**30                 # bytes of a dropped file
+LARGEST_MESSAGE = 2**24              # bytes: clicks and sliders need a few hundred
+LARGEST_FILE = 2**30                 # bytes of a dropped file; larger scans are named on the command line
 TOO_LARGE = f"a file of more than {LARGEST_FILE} bytes"
-PIECE = 2**20                        # bytes of a download at a time
+PIECE = 2**20                        # bytes of a download in memory at a time
+# names that tabs give themselves
 TAB = re.compile(r"[\w-]{8,64}", re.ASCII)
 
 
 class Serving(Protocol):
-    """What answers need of their server."""
+    """What the handlers need of their server."""
 
     app: App
     gate: Gate
@@ -41,24 +42,24 @@ class Serving(Protocol):
     dropped: Path
 
     def tab_opened(self, name: str, tab: Tab) -> None:
-        """A tab opened or came back."""
+        """Welcome a tab that opened or came back."""
         ...
 
     def accept_connection(self, connection: Any) -> None:
-        """The connection of a request has shown the token."""
+        """Note that the connection has shown the token."""
         ...
 
     def take_in(self, name: str, message: Message) -> None:
-        """A message of a tab."""
+        """Act on a message of a tab."""
         ...
 
     def file_dropped(self, name: str, path: Path) -> None:
-        """A file that was stored."""
+        """Act on an uploaded file."""
         ...
 
 
-class Refusal(HTTPError):
-    """A request that is not answered, and why, for the terminal."""
+class RefusedError(HTTPError):
+    """A request that is refused, with the reason for the terminal."""
 
     def __init__(self, status: int, why: str) -> None:
         super().__init__(status)
@@ -66,7 +67,7 @@ class Refusal(HTTPError):
 
 
 class Guarded(RequestHandler):
-    """Anything that is asked of the server: refused unless host, token and, where it acts, origin are ours."""
+    """A request handler that refuses wrong hosts and tokens, and wrong origins where the request changes something."""
 
     acts = False
 
@@ -82,22 +83,22 @@ class Guarded(RequestHandler):
     def prepare(self) -> None:
         gate, host = self.server.gate, self.request.host
         if gate.wrong_host(host):
-            raise Refusal(403, f"foreign Host {host}")
+            raise RefusedError(403, f"foreign Host {host}")
         if self.acts and gate.wrong_origin(host, self.request.headers.get("Origin")):
-            raise Refusal(403, f"foreign Origin {self.request.headers.get('Origin', '(none)')}")
+            raise RefusedError(403, f"foreign Origin {self.request.headers.get('Origin', '(none)')}")
         if not self.passes():
-            raise Refusal(403, "wrong or missing token")
+            raise RefusedError(403, "wrong or missing token")
         if self.get_query_argument("server", gate.server) != gate.server:
-            raise Refusal(403, "a page of an earlier server")
+            raise RefusedError(403, "a page of an earlier server")
         self.server.accept_connection(self.request.connection)
 
     def passes(self) -> bool:
-        """Whether the request has the token."""
+        """Return whether the request has the token."""
         gate = self.server.gate
         return not gate.wrong_token(self.get_query_argument("token", None), self.get_cookie(gate.cookie))
 
     def report_refusal(self, why: str) -> None:
-        """Tell the terminal of a refusal; the token is no part of it."""
+        """Report a refusal in the terminal, without the token."""
         self.server.say(one_line(f"refused: {self.request.method} {self.request.path}: {why}"))
 
     def log_exception(self, typ: Any, value: BaseException | None, tb: Any) -> None:
@@ -108,27 +109,27 @@ class Guarded(RequestHandler):
 
     def write_error(self, status_code: int, **kwargs: Any) -> None:
         self.set_header("Content-Type", "text/plain; charset=utf-8")
-        told = "Refused: open the address that the terminal shows." if status_code == 403 else self._reason
-        self.finish(f"{told}\n")
+        text = "Refused: open the address that the terminal shows." if status_code == 403 else self._reason
+        self.finish(f"{text}\n")
 
 
 class Unknown(Guarded):
-    """Any other address."""
+    """Any other address: refused."""
 
     def prepare(self) -> None:
         super().prepare()
-        raise Refusal(404, "no such address")
+        raise RefusedError(404, "no such address")
 
 
 class Alive(Guarded):
-    """Tells a page that lost its connection whether this is still its server."""
+    """Tells a page that lost its connection whether its server still runs."""
 
     def get(self) -> None:
         self.set_status(204)
 
 
 class PageHandler(Guarded):
-    """The page; a cookie takes the place of the token, so that it can be loaded again."""
+    """The page; a cookie replaces the token, so that it can be loaded again."""
 
     def passes(self) -> bool:
         opening = self.get_query_argument("open", None)
@@ -150,19 +151,20 @@ class Socket(Guarded, WebSocketHandler):
         super().prepare()
         self.tab_name = self.get_query_argument("tab", "")
         if not TAB.fullmatch(self.tab_name):
-            raise Refusal(400, "expected the name of a tab")
+            raise RefusedError(400, "expected the name of a tab")
 
     def get_websocket_protocol(self) -> Any:
         protocol = super().get_websocket_protocol()
         if protocol is not None:
+            # code 1009 is a message that is too large: tornado closes the connection without telling us
             close = protocol.close
 
-            def told(code: int | None = None, reason: str | None = None) -> None:
+            def close_and_report(code: int | None = None, reason: str | None = None) -> None:
                 if code == 1009:
                     self.report_refusal(f"a message of more than {LARGEST_MESSAGE} bytes")
                 close(code, reason)
 
-            protocol.close = told           # type: ignore[method-assign]
+            protocol.close = close_and_report           # type: ignore[method-assign]
         return protocol
 
     def open(self, *args: str, **kwargs: str) -> None:
@@ -175,9 +177,9 @@ class Socket(Guarded, WebSocketHandler):
         self.server.tab_opened(self.tab_name, self.tab)
 
     def end(self) -> None:
-        """Close, without the patience of the protocol where the tab reads nothing."""
+        """Close the connection, without waiting for a tab that reads nothing."""
         stream = getattr(self.ws_connection, "stream", None)
-        behind = stream is not None and stream.writing()     # asked now: the farewell may empty the last buffer
+        behind = stream is not None and stream.writing()     # checked now, as the closing message may empty the buffer
         self.close(1001)
         if stream is not None and behind:
             stream.close()
@@ -196,7 +198,7 @@ class Socket(Guarded, WebSocketHandler):
 
 @stream_request_body
 class Drop(Guarded):
-    """A file that was dropped on the page, written to a temporary folder as it comes."""
+    """A file dropped on the page, written to a temporary folder as it arrives."""
 
     acts = True
 
@@ -204,14 +206,15 @@ class Drop(Guarded):
         self.folder: Path | None = None
         super().prepare()
         if self.request.method != "POST":
-            raise Refusal(405, "only POST")
+            raise RefusedError(405, "only POST")
         try:
             self.name = file_name(self.get_query_argument("name", ""))
             expected = int(self.request.headers.get("Content-Length", 0))
         except ValueError as problem:
-            raise Refusal(400, str(problem)) from None
+            raise RefusedError(400, str(problem)) from None
+        # refuse by the announced size; what really comes is counted too
         if expected > LARGEST_FILE:
-            raise Refusal(413, TOO_LARGE)
+            raise RefusedError(413, TOO_LARGE)
         self.request.connection.set_max_body_size(LARGEST_FILE + PIECE)     # type: ignore[union-attr]
         self.folder = Path(tempfile.mkdtemp(dir=self.server.dropped))
         self.out = open(self.folder / self.name, "wb")
@@ -242,13 +245,14 @@ class Drop(Guarded):
         super().on_connection_close()
 
     def _fail(self, status: int, why: str) -> None:
+        """Refuse the file and remove what has arrived."""
         self._forget()
         self.report_refusal(why)
         self.set_status(status)
         self.finish(why)
 
     def _forget(self) -> None:
-        """Remove what came of the file."""
+        """Remove what has arrived of the file."""
         if self.folder is not None:
             self.out.close()
             shutil.rmtree(self.folder, ignore_errors=True)
@@ -256,20 +260,21 @@ class Drop(Guarded):
 
 
 class Download(Guarded):
-    """A file inside of the folders of the app."""
+    """A file inside the folders of the app."""
 
     async def get(self, name: str) -> None:
         try:
             path = file_inside(self.server.app.folders, name)
         except ValueError as problem:
-            raise Refusal(404, str(problem)) from None
+            raise RefusedError(404, str(problem)) from None
         self.set_header("Content-Type", "application/octet-stream")
         self.set_header("Content-Disposition", f"attachment; filename*=UTF-8''{quote(path.name, safe='')}")
         with open(path, "rb") as stored, contextlib.suppress(StreamClosedError):
-            left = stored.seek(0, 2)
-            self.set_header("Content-Length", str(left))
+            remaining = stored.seek(0, 2)
+            self.set_header("Content-Length", str(remaining))
             stored.seek(0)
-            while piece := stored.read(min(PIECE, left)):
-                left -= len(piece)
+            # piece by piece, as results may be larger than the memory
+            while piece := stored.read(min(PIECE, remaining)):
+                remaining -= len(piece)
                 self.write(piece)
                 await self.flush()

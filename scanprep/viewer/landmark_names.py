@@ -1,4 +1,4 @@
-"""Names of landmarks that people click: a good ten, CAESAR's 73, those of a file."""
+"""Names of landmarks to click: a good ten, the 73 of CAESAR, or those of a file."""
 from __future__ import annotations
 
 from pathlib import Path
@@ -8,6 +8,7 @@ from ..geometry import storage
 from ..geometry.landmark_names import TEN
 from ..geometry.sides import other_side
 
+# landmarks of the CAESAR survey, spelt as in its files: on the middle line, and on both sides of the body
 _MIDDLE = ("Sellion", "Supramenton", "Nuchale", "Suprasternale", "Substernale", "Cervicale", "10th Rib Midspine",
            "Waist, Preferred, Post.", "Crotch")
 _PAIRED = ("Infraorbitale", "Tragion", "Gonion", "Clavicale", "Thelion/Bustpoint", "10th Rib", "ASIS", "Iliocristale",
@@ -18,17 +19,18 @@ _PAIRED = ("Infraorbitale", "Tragion", "Gonion", "Clavicale", "Thelion/Bustpoint
            "Calcaneous, Post.", "Digit II")
 CAESAR = (*_MIDDLE, *(f"{side} {name}" for name in _PAIRED for side in ("Rt.", "Lt.")))
 
+# words that stand for a list on the command line
 LISTS = {"ten": TEN, "caesar": CAESAR}
 
 
-def read_names(given: str) -> tuple[str, ...]:
-    """The names of a list, or of a text file with one in each line; ValueError for a file without any."""
-    if given in LISTS:
-        return LISTS[given]
-    path = Path(given)
+def read_names(word: str) -> tuple[str, ...]:
+    """Return the names of a list, or of a text file with one in each line; ValueError for a file without any."""
+    if word in LISTS:
+        return LISTS[word]
+    path = Path(word)
     if not path.exists():
         raise UsageError(f"--names: expected {', '.join(LISTS)}, or a text file with one name in each line; there is "
-                         f"no file {given}")
+                         f"no file {word}")
     with storage.taking_apart(path, "one name in each line"):
         text = storage.read_bytes(path, "one name in each line").decode("utf-8-sig")
     names = [" ".join(line.split()) for line in text.splitlines()]
@@ -39,9 +41,10 @@ def read_names(given: str) -> tuple[str, ...]:
 
 
 def next_name(names: tuple[str, ...], done: set[str], last: str | None) -> str | None:
-    """The name to offer after `last`: its other side, else the next in the list that is not done; None when all are."""
+    """Return the name to offer after `last`: its other side, else the next that is not done; None when all are done."""
     mirrored = other_side(last) if last else None
     if mirrored in names and mirrored not in done:
         return mirrored
+    # search from the last name on, and then from the beginning
     start = names.index(last) + 1 if last in names else 0
     return next((name for name in (*names[start:], *names[:start]) if name not in done), None)

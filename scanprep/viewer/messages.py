@@ -2,7 +2,7 @@
 
     0  4 bytes   length n of the header, unsigned, little-endian
     4  n bytes   header: JSON in UTF-8 with `kind`, `latest`, `number`, `fields`; blanks up to a multiple of 8
-    4 + n        data, so that arrays of any type can be read where they lie
+    4 + n        data, aligned so that arrays of any type can be read in place
 """
 from __future__ import annotations
 
@@ -14,26 +14,28 @@ from typing import Any
 
 from ..geometry import storage
 
+# length of the header: 4 bytes
 LENGTH = struct.Struct("<I")
+# keys of a header and their types
 KEYS = {"kind": str, "latest": str, "number": int, "fields": dict}
 
 
 @dataclass(frozen=True)
 class Message:
-    """What one side tells the other.
+    """What one side sends to the other.
 
     Parameters
     ----------
     kind : str
         What it is about, such as "pose".
-    fields : Mapping
-        What JSON can hold; arrays become lists, numbers that are not finite null.
+    fields : mapping
+        Values for JSON; arrays become lists, numbers that are not finite become null.
     data : bytes
         Anything else, such as packed geometry.
     latest : str
-        A newer message with this key takes the place of one that still waits, unless one without a key came between.
+        A newer message with this key replaces a waiting older one, unless one without a key came between.
     number : int
-        Where it stands among all messages of its tab; set by the connection of the tab, 0 for no number.
+        Number among the messages of its tab, set by the tab's connection; 0 for none.
     """
 
     kind: str
@@ -43,17 +45,17 @@ class Message:
     number: int = 0
 
     def pack(self) -> bytes:
-        """The message as one binary frame; TypeError for fields that JSON cannot hold."""
+        """Pack the message into one binary frame; TypeError for fields that JSON cannot hold."""
         header = {"kind": self.kind, "latest": self.latest, "number": self.number,
                   "fields": storage.as_json(dict(self.fields))}
         text = json.dumps(header, allow_nan=False, separators=(",", ":")).encode("utf-8")
-        # bytes: data begin at a multiple of this
+        # data begin at a multiple of 8 bytes, which the largest number type needs
         text += b" " * (-(len(text) + LENGTH.size) % 8)
         return LENGTH.pack(len(text)) + text + self.data
 
     @classmethod
     def unpack(cls, raw: bytes | str) -> Message:
-        """The message of a frame; ValueError with what was expected for anything else."""
+        """Unpack the message of a frame; ValueError for anything else."""
         if isinstance(raw, str):
             raise ValueError(f"message: expected a binary frame, got text of {len(raw)} characters")
         if len(raw) < LENGTH.size:
@@ -67,10 +69,10 @@ class Message:
 
 
 def _check(header: Any) -> None:
-    """ValueError where a header has not the keys of a message, each of its type."""
+    """Raise ValueError where a header does not have the keys of a message, each of its type."""
     if not isinstance(header, dict) or set(header) != set(KEYS):
-        found = ", ".join(sorted(map(str, header))) if isinstance(header, dict) else type(header).__name__
-        raise ValueError(f"message: expected a header with {', '.join(KEYS)}, got {found[:200]}")
+        received = ", ".join(sorted(map(str, header))) if isinstance(header, dict) else type(header).__name__
+        raise ValueError(f"message: expected a header with {', '.join(KEYS)}, got {received[:200]}")
     for key, kind in KEYS.items():
         if type(header[key]) is not kind:
             raise ValueError(f"message: {key}: expected {kind.__name__}, got {type(header[key]).__name__}")

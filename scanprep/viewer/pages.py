@@ -1,4 +1,4 @@
-"""An app whose buttons lead to other apps and back, on one server: all of its tabs show the same page."""
+"""An app whose buttons open other apps, on one server; all tabs show the same page."""
 from __future__ import annotations
 
 import threading
@@ -12,23 +12,23 @@ from .messages import Message
 
 
 class Home(App, Protocol):
-    """An app that has pages inside."""
+    """An app that can open other apps."""
 
     def enter(self, send: Send, wanted: Mapping[str, Any]) -> App:
-        """The app of a page that is asked for, the same for the same page; ValueError where it cannot be opened."""
+        """Return the app of a requested page, the same app for the same page; ValueError where it cannot be opened."""
         ...
 
     def on_return(self, app: App) -> None:
-        """The page was left: what it has made is now to be shown."""
+        """React to the return from a page: show what was made there."""
         ...
 
 
 class Pages:
-    """A home and the pages that were opened from it, of which one is shown; those that were left stay as they are.
+    """A home app and the pages opened from it, one of which is shown; the others keep their state.
 
-    The message `page` tells tabs which front end to start. What a tab sends names its page by number: a click on a page
-    that was left meanwhile is dropped, so that it lands on no other body. So is what a page tells that is not shown; it
-    greets when it is shown again.
+    The message `page` tells tabs which front end to start. Messages of tabs carry the number of their page. A click
+    made before the page changed is dropped, so that it cannot act on another body. Messages of hidden pages are dropped
+    too; a page greets again when it is shown.
     """
 
     def __init__(self, home: Home) -> None:
@@ -38,23 +38,24 @@ class Pages:
         self._lock = threading.Lock()
 
     def _show(self, number: int, app: App) -> None:
-        self._shown = number, app                                # the number grows with every turn
+        """Show a page."""
+        self._shown = number, app                                # a new number with every change of page
         self.name: str = app.name
         self.title: str = app.title
         self.folders: Sequence[Path] = app.folders
 
     @property
     def app(self) -> App:
-        """The app that is shown."""
+        """Return the app that is shown."""
         return self._shown[1]
 
     def greet(self) -> list[Message]:
-        """Which page it is, and its greeting."""
+        """Return which page is shown, and its greeting."""
         shown = self._shown
         return [self._page(*shown), *shown[1].greet()]
 
     def handle(self, message: Message, send: Send) -> None:
-        """A page is entered or left; all else is for the app that is shown."""
+        """Open or leave a page, or pass the message on to the app that is shown."""
         number, app = self._shown
         fields = dict(message.fields)
         if fields.pop("page", number) != number:
@@ -64,21 +65,22 @@ class Pages:
         elif message.kind == "leave" and app is not self.home:
             try:
                 self.home.on_return(app)
-            finally:                                             # whatever it has made of it, one gets back
+            finally:                                             # even after an error the user gets back
                 self._turn_to(self.home, send)
         else:
             app.handle(replace(message, fields=fields), self._sender(app, send))
 
     def receive(self, name: str, path: Path, send: Send) -> None:
-        """A file for the page that is shown."""
+        """Pass a file on to the page that is shown."""
         self.app.receive(name, path, self._sender(self.app, send))
 
     def close(self) -> None:
-        """Close all."""
+        """Close all pages."""
         for app in (*self._opened, self.home):
             app.close()
 
     def _turn_to(self, app: App, send: Send) -> None:
+        """Show a page in all tabs."""
         if app is not self.home and app not in self._opened:
             self._opened.append(app)
         with self._lock:
@@ -88,14 +90,15 @@ class Pages:
             self._sender(app, send)(message)
 
     def _page(self, number: int, app: App) -> Message:
+        """Return the message that tells tabs which page is shown."""
         back = "" if app is self.home else self.home.title
         return Message("page", {"number": number, "name": app.name, "title": app.title, "back": back})
 
     def _sender(self, app: App, send: Send) -> Send:
-        """Where an app sends to: to all tabs while it is shown, else nowhere."""
-        def told(message: Message) -> None:
+        """Return a `send` for an app: to all tabs while it is shown, else nowhere."""
+        def send_if_shown(message: Message) -> None:
             with self._lock:
                 if app is self.app:
                     send(message)
 
-        return told
+        return send_if_shown

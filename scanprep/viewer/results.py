@@ -1,4 +1,4 @@
-"""What a command made of many things, in the browser: worst first, mended, and done again in the same folder."""
+"""Results of a command in the browser: worst first, to correct and compute again in the same folder."""
 from __future__ import annotations
 
 import time
@@ -16,44 +16,44 @@ from .pick import PickApp
 
 
 class ResultsApp(PickApp):
-    """The state of a page on which results are mended: bodies to click on, and what is to be thought of each.
+    """A page for correcting results: bodies to click on, and a judgement on each.
 
-    What is built on it says what is clicked (`PickApp`), what the results are worth, and how they are shown.
+    Subclasses say what is clicked (`PickApp`), how good the results are, and how they are shown.
     """
 
-    folder: Path                 # of the results
-    no_result = "not done yet"  # said of a body without a result
+    folder: Path                # of the results
+    no_result = "not done yet"  # shown for a body without result
 
     def judgements(self) -> Iterable[Judgement | None]:
-        """Of the bodies in their order; None for one that has no result."""
+        """Yield the judgement on every body in order; None for one without result."""
         raise NotImplementedError
 
     def read_results(self) -> Any:
-        """What the folder holds now."""
+        """Read the results that the folder holds now."""
         raise NotImplementedError
 
     def show_results(self, results: Any) -> None:
-        """Show what was read."""
+        """Show results that were read."""
         raise NotImplementedError
 
     def more(self) -> dict[str, Any]:
-        """What is to be thought of each body besides."""
+        """Add the judgements to the state."""
         return {**super().more(), "verdicts": [
             {"verdict": "new", "reasons": [self.no_result]} if one is None else
             {"verdict": one.verdict, "reasons": list(one.reasons)} for one in self.judgements()]}
 
     def do_again(self, what: str, command: str, do: Callable[[Workspace, Progress], tuple[Outcome, str]], send: Send,
                  failed: str, give_up: Callable[[], None] = lambda: None) -> None:
-        """Do the work of a command again beside the clicks that go on, and show what came of it.
+        """Run a command again while clicks go on, and show its results.
 
-        The output is open, and closed to other runs, only meanwhile. `do` returns what to say at the end besides;
-        `give_up` is called where it raises an error, which is told after `failed`.
+        The output is locked only meanwhile. `do` returns the outcome and what to say at the end. `give_up` is called
+        when it raises an error, which is reported after `failed`.
         """
-        def work(tell: Progress) -> str:
+        def work(report_progress: Progress) -> str:
             begin = time.perf_counter()
             try:
                 with workspace(self.folder) as space:
-                    outcome, note = do(space, tell)
+                    outcome, note = do(space, report_progress)
                     keep_report(space, outcome, command, time.perf_counter() - begin)
             except Exception:
                 with self._lock:

@@ -1,10 +1,11 @@
-"""The page of a server: one HTML file with everything in it, and the headers that keep it to itself."""
+"""The page of a server as one HTML file, and the headers that protect it."""
 from __future__ import annotations
 
 import json
 import re
 from html import escape
 
+# the first script removes the token from the address bar, the last one starts the front end
 PAGE = """<!doctype html>
 <html lang="en" data-server="{server}">
 <head>
@@ -21,6 +22,7 @@ PAGE = """<!doctype html>
 </body>
 </html>
 """
+# no cache, no frames, no access for other pages
 HEADERS = {
     "Cache-Control": "no-store",
     "X-Content-Type-Options": "nosniff",
@@ -29,20 +31,29 @@ HEADERS = {
     "Cross-Origin-Opener-Policy": "same-origin",
     "Cross-Origin-Resource-Policy": "same-origin",
 }
+# policy of all answers but the page: nothing may be loaded or run
 NOTHING = "default-src 'none'; frame-ancestors 'none'"
 
 
 def page(title: str, name: str, script: str, style: str, server: str, nonce: str) -> str:
-    """The page that starts the front end `name` of the bundle `script`; the address bar loses the token.
+    """Return the HTML page that starts a front end.
 
     Parameters
     ----------
-    script : str
-        JavaScript that defines `scapekit.start(name)`.
+    title : str
+        Title of the page.
+    name : str
+        Name of the front end, passed to `scapekit.start`.
+    script, style : str
+        JavaScript that defines `scapekit.start(name)`, and CSS.
     server : str
-        Name of this server, by which its page knows it again.
+        Name of this server, by which its page recognises it.
     nonce : str
-        Marks the scripts and the style as ours, see `policy`.
+        Marks our scripts and style, see `policy`.
+
+    Returns
+    -------
+    str
     """
     start = json.dumps(name).replace("<", "\\u003C")
     return PAGE.format(title=escape(title), server=escape(server), nonce=nonce, name=start,
@@ -50,7 +61,7 @@ def page(title: str, name: str, script: str, style: str, server: str, nonce: str
 
 
 def policy(host: str, nonce: str) -> str:
-    """The Content-Security-Policy of the page: its own scripts, workers it makes itself, nothing of other machines."""
+    """Return the Content-Security-Policy of the page: own scripts and workers only, nothing from other machines."""
     return "; ".join((
         "default-src 'none'", f"script-src 'nonce-{nonce}' 'wasm-unsafe-eval'", "worker-src blob:",
         f"style-src-elem 'nonce-{nonce}'", "style-src-attr 'unsafe-inline'", "img-src 'self' data: blob:",
@@ -59,5 +70,5 @@ def policy(host: str, nonce: str) -> str:
 
 
 def _inline(script: str) -> str:
-    """A script as it may stand in HTML: what would end it or open a comment occurs in its texts only."""
+    """Escape a script for HTML: what would end it or open a comment occurs only in its strings."""
     return re.sub(r"<(?=/script|!--|script)", r"\\x3C", script, flags=re.IGNORECASE)

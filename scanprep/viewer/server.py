@@ -1,4 +1,4 @@
-"""A server of this machine for one user: a page in a browser, and an app in Python behind it."""
+"""A local web server for one user: a page in the browser, with an app in Python behind it."""
 from __future__ import annotations
 
 import asyncio
@@ -32,13 +32,13 @@ from .worker import Stopped, Worker
 
 __all__ = ["App", "Message", "Send", "Server", "Stopped", "serve"]
 
-ADDRESS = "127.0.0.1"
-GRACE = 0.5                          # seconds that work gets to end
+ADDRESS = "127.0.0.1"                # this machine only
+GRACE = 0.5                          # seconds that running work gets to end
 HERE = Path(__file__).parent
 
 
 class _Door(HTTPServer):
-    """Connections: of those that have not shown the token the oldest is closed where there are too many."""
+    """The HTTP server; of too many connections without token it closes the oldest."""
 
     def initialize(self, *args: Any, **kwargs: Any) -> None:
         super().initialize(*args, **kwargs)
@@ -46,24 +46,26 @@ class _Door(HTTPServer):
 
     def handle_stream(self, stream: IOStream, address: tuple[str, int]) -> None:
         self.strangers = [one for one in self.strangers if not one.closed()]
-        # connections at a time that have not shown the token; a browser opens six
-        if len(self.strangers) >= 64:         # each takes a file from this process, which may have few
+        # a browser opens six; 64 leave room for a flood of strangers
+        if len(self.strangers) >= 64:         # each uses a file handle, of which a process has few
             self.strangers.pop(0).close()
         self.strangers.append(stream)
         super().handle_stream(stream, address)
 
 
 class Server:
-    """An app behind its address, in a thread of its own, from entering the context to leaving it.
+    """An app served at an address, in a thread of its own, while the context is open.
 
     Parameters
     ----------
+    app : App
+        What is shown.
     port : int, optional
-        Any free one unless given; ValueError for one that cannot be had.
-    say : (line) -> None
-        Told of every refusal, and of errors nobody foresaw.
+        By default any free one; ValueError for one that cannot be used.
+    say : callable
+        Called with a line of text for every refusal and unexpected error.
     script, style : str, optional
-        Bundle of the page, unless it is that of the package.
+        Code of the page; by default that of the package.
     """
 
     def __init__(self, app: App, port: int | None = None, say: Callable[[str], None] = console.say,
@@ -80,11 +82,11 @@ class Server:
 
     @property
     def address(self) -> str:
-        """Where the page is, with its token."""
+        """Return the address of the page, with its token."""
         return f"http://{ADDRESS}:{self.port}/?token={self.gate.token}"
 
     def opening(self) -> str:
-        """The address for one use, to hand to a browser."""
+        """Return an address for one use, to hand to a browser."""
         return f"http://{ADDRESS}:{self.port}/?open={self.gate.opening()}"
 
     def __enter__(self) -> Server:
@@ -106,12 +108,12 @@ class Server:
         shutil.rmtree(self.dropped, ignore_errors=True)
 
     def send(self, message: Message) -> None:
-        """Tell all tabs; from any thread. Stopped when the server has ended."""
+        """Send a message to all tabs, from any thread; raises Stopped when the server has ended."""
         frame = message.pack()
         self._in_loop(lambda: self.tabs.put(frame, message.latest))
 
     def tab_opened(self, name: str, tab: Tab) -> None:
-        """A tab opened or came back: it is greeted, then told what all tabs are told."""
+        """Greet a tab that opened or came back; afterwards it gets what all tabs get."""
         self.tabs.join(name, tab)
 
         def greet() -> None:
@@ -124,21 +126,21 @@ class Server:
         self._greeter.put(greet)
 
     def accept_connection(self, connection: Any) -> None:
-        """The connection of a request has shown the token: whatever comes, it stays open."""
+        """Note that the connection has shown the token: it is not closed for lack of room."""
         self._door.strangers = [one for one in self._door.strangers if one is not connection.stream]
 
     def take_in(self, name: str, message: Message) -> None:
-        """A message of a tab, to be handled once however often it comes."""
+        """Handle a message of a tab, once even if it arrives again."""
         if self.tabs.is_new(name, message.number):
             self._worker.put(lambda: self.app.handle(message, self.send), message.latest)
         self.tabs.acknowledge(name)
 
     def file_dropped(self, name: str, path: Path) -> None:
-        """A file that was stored, to be received in its turn, and removed."""
+        """Receive an uploaded file in its turn, and remove it."""
         def receive() -> None:
             try:
                 self.app.receive(name, path, self.send)
-            except ValueError as problem:                # the user knows the file by its own name
+            except ValueError as problem:                # call the file by the name that the user knows
                 raise ValueError(str(problem).replace(str(path), name)) from problem
             finally:
                 shutil.rmtree(path.parent, ignore_errors=True)
@@ -146,6 +148,7 @@ class Server:
         self._worker.put(receive)
 
     def _in_loop(self, job: Callable[[], None]) -> None:
+        """Run a job in the thread of the event loop; raises Stopped when that has ended."""
         try:
             if self._stopped.is_set():
                 raise Stopped
@@ -154,18 +157,19 @@ class Server:
             raise Stopped from None
 
     def _report_failure(self, problem: BaseException) -> None:
-        """A job failed: the tabs are told; the terminal too, once, where nobody foresaw it."""
+        """Report a failed job to the tabs; an unexpected error also once in the terminal."""
         text = str(problem)
         if not isinstance(problem, ValueError):
             text = f"unexpected {type(problem).__name__}: {problem}"
-            trace = "\n".join(map(one_line, "".join(traceback.format_exception(problem)).splitlines()))
-            if trace not in self._told:
-                self._told.add(trace)
-                self.say(trace)
+            traceback_text = "\n".join(map(one_line, "".join(traceback.format_exception(problem)).splitlines()))
+            if traceback_text not in self._told:
+                self._told.add(traceback_text)
+                self.say(traceback_text)
         with contextlib.suppress(Stopped):
             self.send(Message("error", {"text": text}))
 
     async def _run(self) -> None:
+        """Serve until the end is asked for, then close all connections."""
         own = {"server": self}
         routes = [(r"/", handlers.PageHandler, own), (r"/socket", handlers.Socket, own), (r"/drop", handlers.Drop, own),
                   (r"/alive", handlers.Alive, own), (r"/file/(.*)", handlers.Download, own)]
@@ -173,16 +177,16 @@ class Server:
             routes, default_handler_class=handlers.Unknown, default_handler_args=own,      # type: ignore[arg-type]
             log_function=lambda handler: None, websocket_max_message_size=handlers.LARGEST_MESSAGE,
             websocket_ping_interval=30)
-        # bytes of a request that is no file
-        self._door = server = _Door(application, max_body_size=(2**20))
-        server.add_sockets(self._sockets)
+        # a megabyte is plenty for any request but an upload
+        self._door = http_server = _Door(application, max_body_size=(2**20))
+        http_server.add_sockets(self._sockets)
         self._loop, self._ending = asyncio.get_running_loop(), asyncio.Event()
         self._ready.set()
         await self._ending.wait()
-        server.stop()
+        http_server.stop()
         self.tabs.close()
         with contextlib.suppress(asyncio.TimeoutError):
-            await asyncio.wait_for(server.close_all_connections(), GRACE / 2)
+            await asyncio.wait_for(http_server.close_all_connections(), GRACE / 2)
 
 
 def serve(app: App, port: int | None = None, open_browser: bool = True, say: Callable[[str], None] = console.say
@@ -191,8 +195,14 @@ def serve(app: App, port: int | None = None, open_browser: bool = True, say: Cal
 
     Parameters
     ----------
+    app : App
+        What is shown.
+    port : int, optional
+        By default any free one.
     open_browser : bool
         Start the browser of this machine, unless the user is logged in from another one.
+    say : callable
+        Called with each line for the terminal.
     """
     remote = "SSH_CONNECTION" in os.environ
     with contextlib.suppress(KeyboardInterrupt), _terminate_as_interrupt(), Server(app, port, say) as server:
@@ -202,11 +212,11 @@ def serve(app: App, port: int | None = None, open_browser: bool = True, say: Cal
         elif _has_screen():
             webbrowser.open(server.opening())
         while True:
-            time.sleep(0.2)                  # a longer sleep is not interrupted everywhere
+            time.sleep(0.2)                  # seconds: on Windows Ctrl-C does not interrupt a sleep
 
 
 def _listen(port: int | None) -> list[socket.socket]:
-    """Sockets that listen, to this machine only; ValueError for a port that cannot be had."""
+    """Open sockets for this machine only; ValueError for a port that cannot be used."""
     if port is not None and not 0 < port < 2**16:
         raise ValueError(f"port: expected a number from 1 to {2**16 - 1}, got {port}")
     try:
@@ -217,14 +227,14 @@ def _listen(port: int | None) -> list[socket.socket]:
 
 
 def _has_screen() -> bool:
-    """Whether a browser with windows can start here."""
+    """Return whether a graphical browser can start here."""
     return os.name == "nt" or os.uname().sysname == "Darwin" or bool(
         os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
 
 
 @contextlib.contextmanager
 def _terminate_as_interrupt() -> Iterator[None]:
-    """SIGTERM ends the block as Ctrl-C does."""
+    """Make SIGTERM end the block as Ctrl-C does."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return

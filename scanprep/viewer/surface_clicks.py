@@ -1,4 +1,4 @@
-"""What a click on the screen meets: found on the file's own surface, however much of it is drawn."""
+"""Find what a click on the screen hits, on the full surface of the file, however much of it is drawn."""
 from __future__ import annotations
 
 from dataclasses import dataclass
@@ -13,13 +13,13 @@ from ..geometry.surface import Rays, Surface
 
 @dataclass(frozen=True, eq=False)
 class Clickable:
-    """A mesh, or points (n, 3), metres, that rays are sent to."""
+    """A mesh, or points (n, 3), metres, that rays are cast at."""
 
     shape: Mesh | np.ndarray
 
     @property
     def points(self) -> np.ndarray:
-        """(n, 3)"""
+        """(n, 3) float, metres: vertices, or the points."""
         return self.shape.vertices if isinstance(self.shape, Mesh) else self.shape
 
     @cached_property
@@ -38,31 +38,32 @@ class Clickable:
 
     @property
     def has_surface(self) -> bool:
-        """Whether there are triangles; a cloud is clicked on point by point."""
+        """Return whether there are triangles; a point cloud is clicked point by point."""
         return isinstance(self.shape, Mesh) and len(self.shape.faces) > 0
 
     def hit(self, origin: np.ndarray, direction: np.ndarray) -> np.ndarray | None:
-        """Where a ray meets the surface first (3,), metres; None where it passes it by.
+        """Find where a ray first meets the surface (3,), metres; None where it misses.
 
-        The triangle is found in single, the place on it in double precision.
+        The triangle is found in single precision, the place on it in double.
         """
         origin, direction = (np.asarray(v, dtype=float) for v in (origin, direction))
         direction = direction / np.linalg.norm(direction)
         if not self.has_surface:
             return self._point_along(origin, direction)
         face, _ = self._rays.cast(origin[None], direction[None])
-        return None if face[0] < 0 else self._on_plane(int(face[0]), origin, direction)
-
-    def _on_plane(self, face: int, origin: np.ndarray, direction: np.ndarray) -> np.ndarray:
+        if face[0] < 0:
+            return None
+        # intersect the ray with the plane of the triangle that it hits
         assert isinstance(self.shape, Mesh)
-        a, b, c = self.shape.corners[face]
+        a, b, c = self.shape.corners[int(face[0])]
         normal = np.cross(b - a, c - a)
         return origin + direction * (normal @ (a - origin)) / (normal @ direction)
 
     def _point_along(self, origin: np.ndarray, direction: np.ndarray) -> np.ndarray | None:
+        """Find the point that a ray passes closest to, among those in front; None where it misses all."""
         along = (self.points - origin) @ direction
         aside = np.linalg.norm(self.points - origin - along[:, None] * direction, axis=1)
-        # spacings of a cloud: from the ray to points, and along it
+        # within 4 spacings of the ray a click hits; points up to 8 spacings behind the first one count as the same side
         near = np.flatnonzero((aside < 4.0 * self._spacing) & (along > 0))
         if not len(near):
             return None
@@ -70,18 +71,18 @@ class Clickable:
         return self.points[front[aside[front].argmin()]].copy()
 
     def middle(self, origin: np.ndarray, direction: np.ndarray) -> np.ndarray | None:
-        """The middle between where a ray enters the body and where it leaves it: inside, as joints are."""
+        """Find the middle between where a ray enters the body and where it leaves: inside, like joints."""
         first = self.hit(origin, direction)
         if first is None or not self.has_surface:
             return None
         direction = np.asarray(direction, dtype=float) / np.linalg.norm(direction)
         size = float(np.ptp(self.points, axis=0).max())
-        # of the size: so far behind a hit a ray goes on
+        # start a millionth of the size behind the first hit, so that it is not found again
         last = self.hit(first + 1e-6 * size * direction, direction)
         return None if last is None else (first + last) / 2
 
     def nearest(self, point: np.ndarray) -> np.ndarray:
-        """The place on the surface, or the point, nearest to a point (3,)."""
+        """Find the place on the surface, or the point, nearest to a point (3,)."""
         point = np.asarray(point, dtype=float)
         if self.has_surface:
             return self._surface.closest(point[None]).points[0]

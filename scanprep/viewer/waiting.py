@@ -1,4 +1,4 @@
-"""Messages that wait for their turn; of those that replace each other only the newest does."""
+"""A queue of messages in which newer ones replace older ones of the same kind."""
 from __future__ import annotations
 
 from collections import deque
@@ -8,7 +8,7 @@ Item = TypeVar("Item")
 
 
 class Waiting(Generic[Item]):
-    """Items in the order they came. It does not lock: whoever shares it among threads must."""
+    """Items in order of arrival. It has no lock: threads that share it must lock."""
 
     def __init__(self) -> None:
         self._items: deque[tuple[str, Item]] = deque()
@@ -17,9 +17,9 @@ class Waiting(Generic[Item]):
         return len(self._items)
 
     def put(self, item: Item, key: str = "") -> Item | None:
-        """Add an item; one with the same key takes its place and the older is returned.
+        """Add an item; it replaces one with the same key, which is returned.
 
-        Nothing overtakes an item without a key: what was clicked between two moves of a slider sees the first of them.
+        Items never overtake one without a key: a click between two moves of a slider acts on the state after the first.
         """
         for place in range(len(self._items) - 1, -1, -1) if key else ():
             other, old = self._items[place]
@@ -32,5 +32,5 @@ class Waiting(Generic[Item]):
         return None
 
     def take(self) -> tuple[str, Item]:
-        """The oldest key and item; IndexError where nothing waits."""
+        """Remove and return the oldest key and item; IndexError where nothing waits."""
         return self._items.popleft()

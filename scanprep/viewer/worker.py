@@ -1,4 +1,4 @@
-"""A thread that does one job after another, and does not keep the program from ending."""
+"""A thread that runs one job after another, and does not keep the program from ending."""
 from __future__ import annotations
 
 import threading
@@ -10,18 +10,18 @@ Job = Callable[[], None]
 
 
 class Stopped(BaseException):
-    """The server has ended: a job that meets this lets it pass. No `except Exception` takes it for an error."""
+    """The server has ended: jobs let this exception pass. It is no Exception, so that no handler swallows it."""
 
 
 class Worker:
-    """Jobs, one at a time in one thread.
+    """Runs jobs one at a time in one thread.
 
     Parameters
     ----------
     name : str
         Name of the thread.
-    failed : (exception) -> None
-        Told, in the thread, of whatever a job raised but `Stopped`.
+    failed : callable
+        Called, in the thread, with every exception of a job except `Stopped`.
     """
 
     def __init__(self, name: str, failed: Callable[[BaseException], None]) -> None:
@@ -33,13 +33,13 @@ class Worker:
         self._thread.start()
 
     def put(self, job: Job, key: str = "") -> None:
-        """Do this job after those that wait, or in place of one with the same key; see `Waiting`."""
+        """Queue a job, in place of a waiting one with the same key; see `Waiting`."""
         with self._news:
             self._waiting.put(job, key)
             self._news.notify()
 
     def stop(self, seconds: float) -> bool:
-        """Finish what waits, but for no longer than this; False where a job still runs, which ends with the program."""
+        """Finish the waiting jobs, for at most `seconds`; False where a job still runs, which ends with the program."""
         with self._news:
             self._ending = True
             self._news.notify()
@@ -47,6 +47,7 @@ class Worker:
         return not self._thread.is_alive()
 
     def _work(self) -> None:
+        """Run jobs until the end."""
         while (job := self._next()) is not None:
             try:
                 job()
@@ -56,6 +57,7 @@ class Worker:
                 self._failed(problem)
 
     def _next(self) -> Job | None:
+        """Wait for the next job; None at the end."""
         with self._news:
             self._news.wait_for(lambda: len(self._waiting) or self._ending)
             return self._waiting.take()[1] if len(self._waiting) else None

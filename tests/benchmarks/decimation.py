@@ -73,9 +73,11 @@ def peer(name: str) -> Method:
             call = igl.qslim if name == "igl.qslim" else igl.decimate
             return Mesh(*call(np.asfortranarray(v), np.asfortranarray(f), faces)[:2])
         if name == "open3d":
-            pass
-        else:
-            from scanprep.adapters.pymeshlab_filters import meshlab_decimation  # type: ignore[assignment]
+            from scanprep.adapters.open3d_filters import open3d_decimation
+
+            return open3d_decimation(mesh, faces)
+        from scanprep.adapters.pymeshlab_filters import meshlab_decimation
+
         return meshlab_decimation(mesh, faces)
 
     return run

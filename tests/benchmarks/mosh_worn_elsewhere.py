@@ -36,8 +36,8 @@ from completion.mocap.marker_sets.named import load_layout
 from completion.mocap.mosh.mosh import MoshConfig
 from completion.mocap.pose.follow import animate
 from completion.mocap.pose.marked_body import supports
+from completion.mocap.subject.misplaced_markers import MisplacedMarkers, find_misplaced_markers
 from completion.mocap.subject.person import find_person
-from completion.mocap.subject.worn_elsewhere import Worn, find_worn
 from completion.motion import Motion
 from model.body import BodyModel
 from model.files import load_model
@@ -60,7 +60,7 @@ class Solved:
 
     betas: np.ndarray
     layout: MarkerLayout
-    worn: Worn
+    misplaced: MisplacedMarkers
     motion: Motion
 
 
@@ -100,14 +100,14 @@ def mean_body(model: BodyModel, betas: np.ndarray) -> Mesh:
 
 def solved(model: BodyModel, markers: MarkerSequence, layout: MarkerLayout, seek: bool = True) -> Solved:
     """The stages of `mosh` up to the poses, without those that mend tracks; all as it was before without `seek`."""
-    person, worn = find_person(model, markers, layout, CONFIG.person), Worn()
+    person, misplaced = find_person(model, markers, layout, CONFIG.person), MisplacedMarkers()
     if seek:
-        worn = find_worn(model, [markers], layout, person, CONFIG.person)
-    if worn.changes:
-        markers, layout = worn.restore_names(markers, layout), worn.update_layout(layout)
+        misplaced = find_misplaced_markers(model, [markers], layout, person, CONFIG.person)
+    if misplaced.changes:
+        markers, layout = misplaced.restore_names(markers, layout), misplaced.update_layout(layout)
         person = find_person(model, markers, layout, CONFIG.person)
     motion = animate(model.subject(person.betas), markers, person.layout, CONFIG.poses)
-    return Solved(person.betas, person.layout, worn, motion)
+    return Solved(person.betas, person.layout, misplaced, motion)
 
 
 def simulated(model: BodyModel, result: Solved, layout: MarkerLayout) -> np.ndarray:
@@ -217,22 +217,22 @@ def run_case(model: BodyModel, ref: Reference, layout: MarkerLayout, kind: str, 
     markers = MarkerSequence(case.positions, ref.markers.labels, ref.markers.rate).select(there)
     start = time.process_time()
     result = solved(model, markers, layout, seek)
-    seconds, worn = time.process_time() - start, result.worn
+    seconds, misplaced = time.process_time() - start, result.misplaced
     on = result.layout.place(ref.body)
     off = {label: 1e3 * float(np.linalg.norm(on[result.layout.labels.index(label)] - place))
            for label, place in case.moved.items() if label in result.layout.labels}
     usual = np.linalg.norm(layout.select(list(case.moved)).place(ref.body) - np.array(list(case.moved.values())
                            ).reshape(-1, 3), axis=1) if case.moved else np.zeros(0)
-    own = {m.label for m in worn.moved}
+    own = {m.label for m in misplaced.moved}
     untouched = [label for label in ref.markers.labels if label not in case.touched]
     return {"file": ref.name, "kind": kind, "seed": seed, "moved": len(case.moved), "off_mm": off,
-            "found": sorted(own), "unplaced": list(worn.unplaced),
+            "found": sorted(own), "unplaced": list(misplaced.unplaced),
             "away_mm": dict(zip(case.moved, (1e3 * usual).round().tolist(), strict=True)),
             "right": sum(label in own and off[label] < 1e3 * RIGHT for label in case.moved),
             "pairs": len(case.pairs), "pairs_true": [sorted(p) for p in case.pairs],
-            "pairs_found": [sorted(p) for p in worn.exchanged],
-            "pairs_right": sum(frozenset(pair) in case.pairs for pair in worn.exchanged),
-            "false": len(own - set(case.moved)) + sum(frozenset(p) not in case.pairs for p in worn.exchanged),
+            "pairs_found": [sorted(p) for p in misplaced.exchanged],
+            "pairs_right": sum(frozenset(pair) in case.pairs for pair in misplaced.exchanged),
+            "false": len(own - set(case.moved)) + sum(frozenset(p) not in case.pairs for p in misplaced.exchanged),
             "seconds": seconds, **compared(model, ref, result, untouched)}
 
 
@@ -255,9 +255,9 @@ def main() -> None:
         if args.files and path.stem not in args.files:
             continue
         refs.append(reference(model, path, layout))
-        worn, motion = refs[-1].result.worn, refs[-1].result.motion
-        plain.append({"file": path.name, "alarms": [*worn.exchanged, *(m.label for m in worn.moved)],
-                      "unplaced": worn.unplaced, "mm": 1e3 * float(np.nanmean(motion.residuals))})
+        misplaced, motion = refs[-1].result.misplaced, refs[-1].result.motion
+        plain.append({"file": path.name, "alarms": [*misplaced.exchanged, *(m.label for m in misplaced.moved)],
+                      "unplaced": misplaced.unplaced, "mm": 1e3 * float(np.nanmean(motion.residuals))})
         print(plain[-1], flush=True)
     for seed in range(args.first, args.first + args.seeds):
         for kind, ref in product(args.kinds, refs):

@@ -82,12 +82,14 @@ def animate_markers(markers: MarkersArg, output: Output, model: ModelOrNone = No
     names = [path.stem for path in found]
     if twice := sorted({name for name in names if names.count(name) > 1}):      # written over each other
         raise ValueError(f"{markers}: expected files of different names, {twice[0]} comes with several endings")
+    # flags that contradict each other
     if markers.is_file() and names_motion(markers) and (layout or subject_prefix or unlabelled):
         raise ValueError(f"{markers}: a motion has no markers; leave out --layout, --subject-prefix and --unlabelled")
     if unlabelled and layout is None:
         raise UsageError("--unlabelled: expected --layout: which markers are worn, of scape layout list")
     if unlabelled and subject_prefix:
         raise UsageError("--unlabelled: markers without names have no --subject-prefix")
+    # model, subject and all that the files share
     loaded, name = read_model(model)
     body = loaded if subject == "markers" else body_of(loaded, subject, unit)
     work = AnimateTask(loaded, name, None if layout is None else layout_or_file(layout),
@@ -100,7 +102,7 @@ def animate_markers(markers: MarkersArg, output: Output, model: ModelOrNone = No
     if markers.is_file():
         return do_one("following the markers", space, work, Task("motion", markers), settings,
                       f"open {output / 'report.html'}; {output / 'animation.glb'} is for 3D programs")
-    # millimetres, of markers or of the joint centres of another skeleton; 0 for a motion that was copied
+    # the figure that ranks files: distance of markers, or of joint centres of another skeleton; 0 for a copied motion
     errors = MEAN_ERROR, MEAN_DISTANCE
     return FolderCommand(
         ("file",), "{} followed", _summary, lambda rows: figure(rows, *errors), settings,
@@ -109,7 +111,7 @@ def animate_markers(markers: MarkersArg, output: Output, model: ModelOrNone = No
 
 
 def _summary(results: Results, count: int) -> list[Metric]:
-    """The rows of the closing table."""
+    """Return the rows of the closing table."""
     off = {name: figure(rows, MEAN_ERROR, MEAN_DISTANCE) for name, rows in results.values.items()}
     markers = any(m.name == MEAN_ERROR for rows in results.values.values() for m in rows)
     rows = [Metric("files", count), Metric("done before", len(off) - len(results.fresh)),
@@ -122,20 +124,22 @@ def _summary(results: Results, count: int) -> list[Metric]:
 
 
 def read_betas_to(path: Path, n_betas: int) -> BetasTo:
-    """Betas from JSON: at the end, [b1, b2, ...] or {"betas": [...]}; keys {"seconds": [b1, b2, ...]}; or of every
-    frame, [[b1, b2, ...], ...]."""
+    """Read betas from JSON in one of three forms.
+
+    At the end: [b1, b2, ...] or {"betas": [...]}. Keys: {"seconds": [b1, b2, ...]}. Every frame: [[b1, b2, ...], ...].
+    """
     wanted = ('betas at the end, [b1, b2, ...], keys {"0": [b1, ...], "2.5": [...]} in seconds, or [[b1, ...], ...] '
               "of every frame")
     tree = read_json(path, wanted)
     keyed = isinstance(tree, dict) and "betas" not in tree
     try:
-        found = {float(s): np.array(betas, dtype=np.float64) for s, betas in
+        keys = {float(s): np.array(betas, dtype=np.float64) for s, betas in
                  (tree if keyed else {0: tree["betas"] if isinstance(tree, dict) else tree}).items()}
     except (TypeError, ValueError, KeyError, OverflowError):
-        found = {}
-    if not found or any(b.ndim not in ((1,) if keyed else (1, 2)) or not b.size or b.shape[-1] > n_betas
-                        or not np.isfinite(b).all() for b in found.values()):
+        keys = {}
+    if not keys or any(b.ndim not in ((1,) if keyed else (1, 2)) or not b.size or b.shape[-1] > n_betas
+                        or not np.isfinite(b).all() for b in keys.values()):
         raise ValueError(f"{path}: expected {wanted}, at most {n_betas} betas each")
-    for betas in found.values():
+    for betas in keys.values():
         BETAS.check(betas, f"{path}: betas")
-    return found if keyed else found[0.0]
+    return keys if keyed else keys[0.0]

@@ -1,4 +1,4 @@
-"""A motion of a few keys in a table, as an animator writes them by hand. [SCAPE-patent] par. 12"""
+"""Key poses in a table, as an animator writes them by hand, interpolated to a motion. [SCAPE-patent] par. 12"""
 from __future__ import annotations
 
 import re
@@ -20,7 +20,7 @@ from ..files.text import table_numbers
 
 
 def holds_keys(path: Path) -> bool:
-    """Whether a table has columns of joint angles, as joint_angles.csv has them, and not those of markers."""
+    """Tell whether a table has columns of joint angles, as joint_angles.csv, and not of markers."""
     if path.suffix.lower() not in (".csv", ".tsv") or not path.is_file():
         return False
     with storage.taking_apart(path, "a table"):
@@ -29,33 +29,37 @@ def holds_keys(path: Path) -> bool:
 
 
 def read_keys(path: Path, subject: Subject, unit: str | None = None, rate: float | None = None) -> BodyMotion:
-    """The motion between the keys of a table.
+    """Read key poses from a table and interpolate them to a motion.
 
-    The columns are `time` in seconds, then `PART_rx, PART_ry, PART_rz` of some parts, their rotation vectors against
-    the parent in degrees, as joint_angles.csv has them: a line of that file is a key. `trans_x, trans_y, trans_z` are
-    metres from where the model stands. A part without columns stays at rest; where its cells are empty it has no key.
-    Nothing goes beyond its keys, and what is alike in two of them stays so between them. Joints turn the shorter way.
+    The columns are `time` in seconds, then `PART_rx, PART_ry, PART_rz` of some parts, their rotation vectors relative
+    to the parent in degrees, as in joint_angles.csv: a line of that file is a key. `trans_x, trans_y, trans_z` are
+    metres from where the model stands. A part without columns stays at rest; empty cells are no key. Interpolation does
+    not overshoot, and values that are equal in two keys stay so between them. Joints turn the shorter way.
 
     Parameters
     ----------
     path : Path
+        CSV or TSV.
     subject : Subject
         The body that moves.
     unit : str, optional
         Of the trans columns, else metres.
     rate : float, optional
-        Frames a second of the motion, else 30.
+        Frames per second of the motion, else 30.
 
     Raises
     ------
     StorageError
-        Another table, a part that the body does not have, times that do not grow.
+        Another table, a part that the body does not have, times that do not increase.
 
     Examples
     --------
-    >>> Path("wave.csv").write_text("time,upper_arm_right_rx\\n0,0\\n1,90\\n")
-    >>> read_keys(Path("wave.csv"), subject).poses.shape
-    (31, 18, 3)
+    >>> from tempfile import mkdtemp
+    >>> from model import load_built_in_model
+    >>> path = Path(mkdtemp()) / "wave.csv"
+    >>> _ = path.write_text("time,upper_arm_right_rx,upper_arm_right_ry,upper_arm_right_rz\\n0,0,0,0\\n1,90,0,0\\n")
+    >>> read_keys(path, load_built_in_model().subject()).poses.shape
+    (31, 16, 3)
 
     [SCAPE-patent] par. 12
     """
@@ -63,6 +67,7 @@ def read_keys(path: Path, subject: Subject, unit: str | None = None, rate: float
     head, names = [word.lower() for word in rows[0][1]] if rows else [], subject.skeleton.names
     known = {f"{name}_r{axis}".lower(): (j, k) for j, name in enumerate(names) for k, axis in enumerate("xyz")}
     place = ("trans_x", "trans_y", "trans_z")
+    # check the header: known columns, each once, and keys below it
     unknown = [word for word in head if word not in known and word not in ("time", *place)]
     if unknown:
         raise storage.StorageError(f"{path}: line 1: expected the columns time, PART_rx, PART_ry, PART_rz, ..., "
@@ -72,6 +77,7 @@ def read_keys(path: Path, subject: Subject, unit: str | None = None, rate: float
                                    f"{','.join(head)[:80]}")
     if not rows[1:]:
         raise storage.StorageError(f"{path}: expected keys below the first line, found none")
+    # numbers, with times that increase
     table = table_numbers(path, rows[1:], len(head), separator, fill=True)
     lines = [number for number, _ in rows[1:]]
     times = table[:, head.index("time")]
@@ -79,15 +85,15 @@ def read_keys(path: Path, subject: Subject, unit: str | None = None, rate: float
     if len(wrong):
         raise storage.StorageError(f"{path}: line {lines[wrong[0]]}: expected a time in seconds that is later than "
                                    f"that of the key before, found {times[wrong[0]]:g}")
-    # frames a second between keys
+    # 30 frames a second by default; 200,000 frames are nearly two hours, more are times in other units than seconds
     rate = rate or 30.0
     span = (times[-1] - times[0]) * rate
-    # nearly two hours of them; more are times in other units than seconds
     if span >= 200_000:
         raise storage.StorageError(f"{path}: expected times in seconds, those from {times[0]:g} to {times[-1]:g} would "
                                    f"be {span:.3g} frames at {rate:g} a second")
     at = times[0] + np.arange(int(span + 1e-6) + 1) / rate
 
+    # interpolate every part between its own keys, then the place
     columns = {word: i for i, word in enumerate(head)}
     poses = np.zeros((len(at), len(names), 3))
     for j, name in enumerate(names):
@@ -103,22 +109,23 @@ def read_keys(path: Path, subject: Subject, unit: str | None = None, rate: float
 
 
 def judge_keys(poses: np.ndarray) -> Judgement:
-    """What poses (T, J, 3) from keys are worth, radians: those of somebody who wrote radians hardly move."""
+    """Judge poses (T, J, 3) from keys, radians: angles that were given in radians by mistake hardly move."""
     largest = float(np.degrees(np.linalg.norm(poses, axis=-1)).max())
     return Judgement.of(check=[f"no joint turns by more than {largest:.2g} degrees; if the table has radians, write "
                                "degrees"] if 0 < largest < 2 * np.pi else [])
 
 
 def interpolate_rotations(times: np.ndarray, turns: np.ndarray, at: np.ndarray) -> np.ndarray:
-    """Rotation vectors (T, 3), radians, at some times, between those (n, 3) at growing `times` (n,).
+    """Interpolate rotation vectors (n, 3), radians, at increasing `times` (n,), at times `at` (T,).
 
-    Monotone cubics of unit quaternions of continuous sign. A spline of continuous acceleration, as `RotationSpline`,
-    would swing beyond keys: an arm that is held up through two keys would not stay.
+    Unit quaternions of continuous sign are interpolated by monotone cubics. A spline of continuous acceleration, such
+    as `RotationSpline`, would overshoot: an arm that is held up through two keys would not stay still.
 
     Examples
     --------
-    >>> np.degrees(turned_between([0, 1], np.radians([[0, 0, 0], [90, 0, 0]]), [0.5]))
-    array([[45., 0., 0.]])
+    >>> turns = np.radians([[0, 0, 0], [90, 0, 0]])
+    >>> np.degrees(interpolate_rotations(np.array([0, 1]), turns, np.array([0.5]))).round(6).tolist()
+    [[45.0, 0.0, 0.0]]
     """
     q = Rotation.from_rotvec(turns).as_quat()
     turned = np.einsum("nc,nc->n", q[1:], q[:-1]) < 0
@@ -127,7 +134,7 @@ def interpolate_rotations(times: np.ndarray, turns: np.ndarray, at: np.ndarray) 
 
 
 def _between(times: np.ndarray, values: np.ndarray, at: np.ndarray) -> np.ndarray:
-    """Values (T, K) at some times between those (n, K) of keys; before the first and after the last they stay."""
+    """Interpolate values (n, K) of keys at some times (T,), constant before the first and after the last key."""
     if len(times) == 1:
         return np.repeat(values, len(at), axis=0)
     return PchipInterpolator(times, values)(np.clip(at, times[0], times[-1]))
@@ -135,17 +142,17 @@ def _between(times: np.ndarray, values: np.ndarray, at: np.ndarray) -> np.ndarra
 
 def _coordinates(path: Path, table: np.ndarray, columns: dict[str, int], wanted: Sequence[str], lines: Sequence[int]
                  ) -> np.ndarray:
-    """Three columns (n, 3) of a table, 0 for one that it does not have; all of a line or none are NaN."""
-    there = [k for k, word in enumerate(wanted) if word in columns]
-    found = np.zeros((len(table), 3)) if there else np.full((len(table), 3), np.nan)
-    for k in there:
-        found[:, k] = table[:, columns[wanted[k]]]
-    given = np.isfinite(found[:, there])
-    half = np.flatnonzero(given.any(axis=1) & ~given.all(axis=1))
+    """Return three columns (n, 3) of a table, 0 for missing columns; in a line all or none are NaN."""
+    present = [k for k, word in enumerate(wanted) if word in columns]
+    values = np.zeros((len(table), 3)) if present else np.full((len(table), 3), np.nan)
+    for k in present:
+        values[:, k] = table[:, columns[wanted[k]]]
+    finite = np.isfinite(values[:, present])
+    half = np.flatnonzero(finite.any(axis=1) & ~finite.all(axis=1))
     if len(half):
         raise storage.StorageError(f"{path}: line {lines[half[0]]}: expected numbers in all of "
-                                   f"{', '.join(wanted[k] for k in there)}, or in none for a line without this key")
-    if np.isinf(found).any():
+                                   f"{', '.join(wanted[k] for k in present)}, or in none for a line without this key")
+    if np.isinf(values).any():
         raise storage.StorageError(f"{path}: expected finite numbers in {wanted[0]}")
-    found[~given.all(axis=1)] = np.nan
-    return found
+    values[~finite.all(axis=1)] = np.nan
+    return values

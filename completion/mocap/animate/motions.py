@@ -1,4 +1,4 @@
-"""A motion of another skeleton (BVH, AMASS) on a body, and what is told of it."""
+"""Motions of another skeleton (BVH, AMASS), or keys, on a body, with figures and page."""
 from __future__ import annotations
 
 from dataclasses import replace
@@ -28,12 +28,12 @@ MEAN_DISTANCE = "distance of joint centres, mean"
 
 
 def names_motion(path: Path) -> bool:
-    """Whether a file is to be read as a motion, not as markers."""
+    """Tell whether a file is read as a motion, not as markers."""
     return path.suffix.lower() in ENDINGS or holds_keys(path)
 
 
 def motion_among(path: Path) -> bool:
-    """Whether a file of a folder is a motion; archives of other things may lie there."""
+    """Tell whether a file of a folder is a motion; .npz files of other kinds may be there."""
     try:
         return path.suffix.lower() == ".bvh" or (path.suffix.lower() in ENDINGS and holds_poses(path))
     except StorageError:
@@ -42,33 +42,37 @@ def motion_among(path: Path) -> bool:
 
 def bring(path: Path, model: BodyModel, name: str, subject: Subject | None, unit: str | None, rate: float | None,
           room: TaskContext) -> tuple[list[Metric], Motion, Subject, Page]:
-    """Bring a motion or keys onto a body and write it into the folder of a room; the figures, and the page to be
-    written."""
+    """Retarget a motion or keys to a body and write it into the folder of a task.
+
+    Returned are the figures, the motion, the body, and the page, which is not written yet.
+    """
+    # keys, or a motion of another skeleton; without a subject a motion may have betas of its own
     if holds_keys(path):
         body = subject if subject is not None else model.subject(np.zeros(1) if model.n_betas else None)
-        found = read_keys(path, body, unit, rate)
-        judgement = judge_keys(found.poses)
+        source = read_keys(path, body, unit, rate)
+        judgement = judge_keys(source.poses)
     else:
-        found = read_motion(path, model, subject, unit, rate)
-        body = subject if subject is not None else model.subject(found.betas)
-        judgement = judge_fit(found.fit)
-    motion = Motion.of(found)
-    metrics = [judgement_row(judgement), Metric("model", name), *transfer_figures(found)]
+        source = read_motion(path, model, subject, unit, rate)
+        body = subject if subject is not None else model.subject(source.betas)
+        judgement = judge_fit(source.fit)
+    motion = Motion.of(source)
+    metrics = [judgement_row(judgement), Metric("model", name), *transfer_figures(source)]
     write_motion_folder(room.folder, motion, body)
     metrics += write_glb(room.folder / "animation.glb", motion, body)
+    # the page, with the joint centres of the other skeleton if there is one
     page = Page(f"{path.name}, on the body", "The body in motion" + (
         ", with dots where the joint centres of the motion's own skeleton would be with bones as long as these."
-        if found.fit else "."))
-    if found.fit is None:
+        if source.fit else "."))
+    if source.fit is None:
         page.bodies([moving_pane(motion, body)], "Press the triangle to play, drag the body to turn it.", 520)
     else:
-        _joints(page, replace(motion, residuals=found.fit.distances, labels=found.fit.names,
-                              trusted=np.ones_like(found.fit.distances, dtype=bool)), body, found.fit, room.folder)
+        _joints(page, replace(motion, residuals=source.fit.distances, labels=source.fit.names,
+                              trusted=np.ones_like(source.fit.distances, dtype=bool)), body, source.fit, room.folder)
     return metrics, motion, body, page.section("Figures").figures(metrics)
 
 
 def judge_fit(fit: RetargetingError | None) -> Judgement:
-    """What a motion is worth that was brought onto a body."""
+    """Judge a retargeted motion by the directions of its segments and the lean of its skeleton."""
     reasons = []
     if fit is not None and fit.angle > MOST:
         worst = int(fit.angles.mean(axis=0).argmax())
@@ -81,7 +85,7 @@ def judge_fit(fit: RetargetingError | None) -> Judgement:
 
 
 def transfer_figures(found: BodyMotion) -> list[Metric]:
-    """How the motion came onto the body, and how well it follows."""
+    """Return figures of the retargeting: how it was done, and how well the body follows."""
     out = [Metric("frames", len(found.poses)), Metric("rate", found.rate, "1/s"), Metric("copied", found.how)]
     if found.rest:
         out.append(Metric("rest of its skeleton", found.rest))
@@ -101,7 +105,7 @@ def transfer_figures(found: BodyMotion) -> list[Metric]:
 
 
 def _joints(page: Page, motion: Motion, body: Subject, fit: RetargetingError, folder: Path) -> None:
-    """The body with the joint centres that it follows; the residuals of `motion` are their distances."""
+    """Add the body with the joint centres that it follows; the residuals of `motion` are their distances."""
     page.bodies([pane_with_dots(motion, body, fit.wanted, "joint centres of the motion", [*map(_words, fit.names)],
                                 True)],
                 "Press the triangle to play, drag the body to turn it; it is kept in the middle.", 520)
@@ -114,6 +118,6 @@ def _joints(page: Page, motion: Motion, body: Subject, fit: RetargetingError, fo
 
 
 def _words(joint: str) -> str:
-    """The joint at the end of a segment as a sentence has it."""
+    """Return the name of the joint at the end of a segment, for a sentence."""
     side = {"l_": "left ", "r_": "right "}.get(joint[:2], "")
     return {"skullbase": "head", "shoulders": "middle of the shoulders"}.get(joint, side + joint[2:])

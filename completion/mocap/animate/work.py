@@ -1,4 +1,4 @@
-"""One file of markers or of a motion: whose body, its motion, and all that is written of it, with the page."""
+"""The work of `scape animate` on one file of markers or of a motion: the person, its motion, all files, the page."""
 from __future__ import annotations
 
 from dataclasses import dataclass
@@ -38,8 +38,8 @@ from ..pose.coverage import find_coverage
 from ..pose.follow import AnimateConfig, animate
 from ..pose.judgement import judge_motions, markers_told, motion_doubts, motion_problem
 from ..retargeting.retarget import morph_vertices, retarget
+from ..subject.misplaced_markers import MisplacedMarkers, find_misplaced_markers
 from ..subject.person import PersonConfig, PersonFit, find_person
-from ..subject.worn_elsewhere import Worn, find_worn
 from .motions import bring, names_motion
 
 BetasTo = dict[float, np.ndarray] | np.ndarray      # keys over seconds, betas (k,) at the end or (T, k) of every frame
@@ -48,15 +48,15 @@ MEAN_ERROR = "distance of markers, mean"
 
 @dataclass(frozen=True, eq=False)
 class AnimateTask:
-    """What is the same for all files of a call; without a subject it is found from the markers."""
+    """Settings that all files of a call share; without a subject it is found from the markers."""
 
     model: BodyModel
-    name: str                            # of the model, for the output
-    layout: str | Path | None            # a named one, or a file; else the named one that fits the labels best
-    subject: Subject | None
-    retarget_to: Subject | None          # another person, who makes the motion too
-    betas_to: BetasTo | None             # how the body changes in the motion
-    unit: str | None                     # as `read_markers` takes it, and whose markers
+    name: str                            # name of the model, for the output
+    layout: str | Path | None            # a name or a file; None for the named one that fits the labels best
+    subject: Subject | None              # None: found from the markers
+    retarget_to: Subject | None          # another person, to whom the motion is retargeted
+    betas_to: BetasTo | None             # how the shape changes over the motion
+    unit: str | None                     # as for `read_markers`
     who: str | None
     rate: float | None                   # frames a second, where a file does not say
     animate: AnimateConfig
@@ -64,8 +64,9 @@ class AnimateTask:
     unlabelled: bool = False             # markers have no names
 
     def __call__(self, path: Path, room: TaskContext) -> list[Metric]:
-        """Follow the markers of a file, or bring its motion onto the body, write everything into the folder of a room,
-        and return the figures; the first says what the motion is worth.
+        """Follow the markers of a file, or retarget its motion, and write everything into the folder of a task.
+
+        Returned are the figures, the judgement first.
         """
         metrics, motion, body, page = bring(path, self.model, self.name, self.subject, self.unit, self.rate, room) \
             if names_motion(path) else self._follow(path, room)
@@ -86,7 +87,8 @@ class AnimateTask:
         return metrics
 
     def _follow(self, path: Path, room: TaskContext) -> tuple[list[Metric], Motion, Subject, Page]:
-        """The motion of the markers of a file."""
+        """Compute the motion of the markers of a file and write it."""
+        # read the markers, and label them first if they have no names
         labelling = Judgement()
         if self.unlabelled:
             usual, _ = choose_layout(self.model, self.layout, ())
@@ -96,29 +98,31 @@ class AnimateTask:
             sequence = read_markers(path, self.unit, self.who, self.rate)
         layout, name = choose_layout(self.model, self.layout, sequence.labels)
         metrics = [Metric("model", self.name), Metric("layout", name)]
-        body, found, worn, placed = self.subject, None, Worn(), Judgement()
+        body, fit, misplaced, placed = self.subject, None, MisplacedMarkers(), Judgement()
+        # the person, found from the markers
         if body is None:
             usual = layout
-            sequence, found, worn = self._person(sequence, layout, room)
-            placed = found.judgement(usual)
-            body, layout = self.model.subject(found.betas), found.layout
-            metrics += [Metric("subject", f"{len(found.betas)} betas from {len(found.frames)} frames"),
-                        *worn.metrics(), *found.metrics(usual)]
-        # a person found from a model: what it was found from tells as much as its body, and sooner
-        whose = self.subject if found is None else (self.model, found.betas)
+            sequence, fit, misplaced = self._person(sequence, layout, room)
+            placed = fit.judgement(usual)
+            body, layout = self.model.subject(fit.betas), fit.layout
+            metrics += [Metric("subject", f"{len(fit.betas)} betas from {len(fit.frames)} frames"),
+                        *misplaced.metrics(), *fit.metrics(usual)]
+        # the key of the kept motion: of a found person its betas, which are quicker to digest than its body
+        whose = self.subject if fit is None else (self.model, fit.betas)
         motion = room.step("motion", (whose, sequence, layout, self.animate),
                            lambda: animate(body, sequence, layout, self.animate, room.tell))
         output = room.folder
-        if found is not None:
-            storage.write_json(output / "subject.json", {"betas": found.betas.tolist(),
-                                                         "frames": found.frames[:, 1].tolist()})
+        if fit is not None:
+            storage.write_json(output / "subject.json", {"betas": fit.betas.tolist(),
+                                                         "frames": fit.frames[:, 1].tolist()})
             layout.save(output / "layout.json")
+        # what the markers determine, and a judgement of labels, motion, markers and person
         covered = find_coverage(body, layout, [motion], [sequence])
         moving = Judgement.of(motion_problem(motion, body.template, layout, sequence),
                               motion_doubts([motion], [sequence], body.template))
-        judgement = covered.judgement().merge(labelling, moving, worn.judgement(sequence.labels), placed)
-        if found is not None:
-            judgement = judge_motions(person_judgement(self.model, found.betas), judgement, [motion], body.template)
+        judgement = covered.judgement().merge(labelling, moving, misplaced.judgement(sequence.labels), placed)
+        if fit is not None:
+            judgement = judge_motions(person_judgement(self.model, fit.betas), judgement, [motion], body.template)
         metrics = [judgement_row(judgement), *metrics, *covered.metrics(), *motion_figures(motion)]
         write_motion_folder(output, motion, body, remove_distrusted(motion, sequence), covered.told)
         metrics += write_glb(output / "animation.glb", motion, body)
@@ -128,23 +132,23 @@ class AnimateTask:
         return metrics, motion, body, page
 
     def _person(self, sequence: MarkerSequence, layout: MarkerLayout, room: TaskContext
-                ) -> tuple[MarkerSequence, PersonFit, Worn]:
-        """The markers under their right names, whose they are, and how they are worn."""
+                ) -> tuple[MarkerSequence, PersonFit, MisplacedMarkers]:
+        """Find the person; return the markers under corrected names, the fit, and misplaced markers."""
         def find(name: str, markers: MarkerSequence, usual: MarkerLayout) -> PersonFit:
             return room.step(name, (self.model, markers, usual, self.person),
                              lambda: find_person(self.model, markers, usual, self.person, room.tell))
 
-        found = find("subject", sequence, layout)
-        worn = room.step("worn", (self.model, sequence, layout, found, self.person),
-                         lambda: find_worn(self.model, [sequence], layout, found, self.person))
-        if not worn.changes:
-            return sequence, found, worn
-        sequence = worn.restore_names(sequence, layout)
-        return sequence, find("subject again", sequence, worn.update_layout(layout)), worn
+        fit = find("subject", sequence, layout)
+        misplaced = room.step("misplaced", (self.model, sequence, layout, fit, self.person),
+                              lambda: find_misplaced_markers(self.model, [sequence], layout, fit, self.person))
+        if not misplaced.changes:
+            return sequence, fit, misplaced
+        sequence = misplaced.restore_names(sequence, layout)
+        return sequence, find("subject again", sequence, misplaced.update_layout(layout)), misplaced
 
 
 def motion_figures(motion: Motion) -> list[Metric]:
-    """What a motion is judged by."""
+    """Return the figures by which a motion is judged."""
     seen = np.isfinite(motion.residuals)
     off = MM * motion.residuals[seen] if seen.any() else np.array([np.nan])
     frame = MM * np.where(seen, motion.residuals, 0).sum(axis=1) / np.maximum(seen.sum(axis=1), 1)
@@ -158,7 +162,7 @@ def motion_figures(motion: Motion) -> list[Metric]:
 
 
 def betas_in_motion(given: BetasTo, motion: Motion) -> dict[float, np.ndarray] | np.ndarray:
-    """Betas at some seconds or (T, k) in every frame of a motion, from these or from those at its end."""
+    """Return betas at some seconds, or (T, k) for every frame; betas at the end become keys at both ends."""
     if isinstance(given, dict):
         return given
     if given.ndim == 2:
@@ -171,21 +175,22 @@ def betas_in_motion(given: BetasTo, motion: Motion) -> dict[float, np.ndarray] |
 
 
 def motion_page(motion: Motion, subject: Subject, markers: MarkerSequence, name: str, metrics: list[Metric]) -> Page:
-    """The page of `scape animate`."""
+    """Make the page of `scape animate`."""
     page = Page(f"{name}, animated", "The body in motion, with the markers that were measured as dots.")
     page.bodies([pane_with_dots(motion, subject, markers.positions, "measured markers", markers.labels)],
                 "Press the triangle to play, drag the body to turn it; it is kept in the middle.", 520)
     page.section("Markers").chart(chart_residuals(motion), "distance of the markers to where the body puts them")
     page.bodies(frame_panes(motion, subject, markers.positions, worst_frames(motion, 5)),
                 "where the markers are farthest off", 300)
+    # which markers were seen and trusted, over time and in a table
     used = np.isfinite(motion.residuals).any(axis=0)
     labels = [label for label, is_used in zip(motion.labels, used, strict=True) if is_used]
     missing = ~np.isfinite(motion.residuals[:, used])
     state = np.where(missing, 2, np.where(motion.trusted[:, used], 0, 1))
     page.chart(chart_states(state, labels, motion.rate, ("#dfe7ee", "#e39b3b", "#8c2f39")),
                "light: seen; orange: seen, but not believed; red: missing")
-    told = marker_rows(motion.labels, motion.residuals, None, motion.trusted)
-    page.table([(*row[:2], *row[3:]) for row in told],
+    rows = marker_rows(motion.labels, motion.residuals, None, motion.trusted)
+    page.table([(*row[:2], *row[3:]) for row in rows],
                ("marker", "mean distance (mm)", "95th percentile (mm)", "seen (%)", "believed (%)"))
     unused = [label for label in motion.labels if label not in labels]
     if unused:

@@ -1,4 +1,4 @@
-"""Marker artefacts: labels that two markers have swapped, markers that slip, jitter or stray; and virtual markers."""
+"""Marker artefacts: swapped labels, markers that slip, jitter or stray; and files of virtual markers."""
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
@@ -28,9 +28,16 @@ class ArtefactConfig(Settings):
     slip : float, metres
         Least lasting displacement of a marker in the frame of its body part.
     stray : float, metres
-        Least distance from the simulated marker for a marker that is somewhere else for a while.
+        Least distance from the simulated marker for a marker that strays for a while.
     noise : float, metres
         Least jitter from frame to frame, as the median length of the second difference.
+
+    Examples
+    --------
+    >>> ArtefactConfig(slip=0.02).stray
+    0.06
+
+    [MoSh]
     """
 
     slip: float = 0.015
@@ -40,7 +47,7 @@ class ArtefactConfig(Settings):
 
 @dataclass(frozen=True, eq=False)
 class Swap:
-    """Two markers that bore each other's label from one frame to another, both included."""
+    """Two markers that were swapped from one frame to another, both included."""
 
     first: str
     second: str
@@ -53,9 +60,9 @@ BadKind = Literal["slipped", "noisy", "stray"]
 
 @dataclass(frozen=True, eq=False)
 class BadSpan:
-    """A marker that was not where the body says, from one frame to another, both included.
+    """A bad marker, far from its simulation, from one frame to another, both included.
 
-    "slipped" stays displaced, "noisy" jitters, "stray" is somewhere else for a while; the distance from the simulated
+    "slipped" stays displaced, "noisy" jitters, "stray" is elsewhere for a while. The distance from the simulated
     marker, metres, is the median of the span.
     """
 
@@ -68,23 +75,23 @@ class BadSpan:
 
 @dataclass(frozen=True, eq=False)
 class MarkerArtefacts:
-    """What is wrong with the markers of a sequence.
+    """The artefacts of the markers of a sequence.
 
     Attributes
     ----------
     swaps : tuple of Swap
     bad : tuple of BadSpan
     simulated : (T, L, 3) float, metres
-        Where the body puts the markers that the layout knows, in the order of `labels`.
+        Simulated markers of the layout, in the order of `labels`.
     labels : L strings
     repaired : MarkerSequence
-        The sequence with swapped labels put right and bad spans taken out (NaN).
+        The sequence with corrected labels, and NaN in bad spans.
     weights : (T, L) float in [0, 1]
-        How far each marker is believed; 0 where it was not seen.
+        Robust weight of each marker; 0 where it was not seen.
     expected : (T, L, 3) float, metres
-        The simulated markers, off by what the measured ones are off around that time: they join them without a step.
+        Simulated markers plus the offset of the measured ones around that time, so that gaps are filled without a step.
     order : (T, all labels of the sequence) int
-        From which label of the sequence, as it came, each one was taken.
+        Column of the original sequence from which each label was taken.
     """
 
     swaps: tuple[Swap, ...]
@@ -106,9 +113,9 @@ class MarkerArtefacts:
         return MarkerSequence(out, self.repaired.labels, self.repaired.rate)
 
     def rename_labels(self, order: np.ndarray, seen: np.ndarray) -> MarkerArtefacts:
-        """The same of the sequence as it came, from whose columns `order` (L,) the labels were taken all through.
+        """Return the artefacts in the labels of the original sequence, whose columns `order` (L,) were used throughout.
 
-        `seen` (T, L) is where its markers were seen.
+        `seen` (T, L) marks where the original markers were seen.
         """
         if (order == np.arange(len(order))).all():
             return self
@@ -117,54 +124,66 @@ class MarkerArtefacts:
 
     @property
     def labels_touched(self) -> set[str]:
-        """Labels that were swapped or bad at some time."""
+        """Labels that were swapped or bad at any time."""
         return {label for s in self.swaps for label in (s.first, s.second)} | {b.label for b in self.bad}
 
 
 def list_swaps(order: np.ndarray, seen: np.ndarray, labels: tuple[str, ...]) -> tuple[Swap, ...]:
-    """The swaps that an order (T, L) is made of, a longer cycle as pairs; one of the two is seen at both ends."""
+    """Return the swaps of an order (T, L), longer cycles as pairs; at both ends one of the two markers is seen."""
     frames: dict[tuple[int, int], list[int]] = {}
     for t in np.flatnonzero((order != np.arange(order.shape[1])).any(axis=1)):
         left = order[t].copy()
         for a in range(len(left)):
-            while left[a] != a:                                        # puts one label right at a time
+            while left[a] != a:                                        # each swap corrects one label
                 b = int(left[a])
                 left[a], left[b] = left[b], b
                 frames.setdefault((min(a, b), max(a, b)), []).append(int(t))
     out = []
+    # successive frames of a pair are one swap, from the first to the last frame with one of them in sight
     for (a, b), times in frames.items():
         for run in stretches(np.array(times)):
-            there = run[seen[run, a] | seen[run, b]]
-            if len(there):
-                out.append(Swap(labels[a], labels[b], int(there[0]), int(there[-1])))
+            visible = run[seen[run, a] | seen[run, b]]
+            if len(visible):
+                out.append(Swap(labels[a], labels[b], int(visible[0]), int(visible[-1])))
     return tuple(sorted(out, key=lambda s: (s.begin, s.first, s.second)))
 
 
 def write_virtual(path: str | Path, artefacts: MarkerArtefacts, original: str | Path | None = None,
                   subject_prefix: str | None = None, unit: str | None = None, joints: MarkerSequence | None = None
                   ) -> None:
-    """Write the markers of a sequence with all gaps filled, whole or not at all.
+    """Write the markers of a sequence with all gaps filled; the file appears whole or not at all.
 
-    In a C3D file, points that were computed have residual 0 and no cameras, as the format says, and measured ones a
-    residual above 0. Into a copy of the original file the points are put where they stand there: everything else,
-    such as analog channels and events, stays byte for byte. A CSV file cannot tell computed points.
+    In a C3D file, computed points have residual 0 and no cameras, as the format says, and measured ones a residual
+    above 0. In a copy of the original file only the points change: everything else, such as analog channels and
+    events, stays byte for byte. A CSV file cannot mark computed points.
 
     Parameters
     ----------
     path : str or Path
         A name that ends in `.c3d` or `.csv`.
     artefacts : MarkerArtefacts
+        Of the sequence.
     original : str or Path, optional
         The C3D file that the sequence was read from.
     subject_prefix, unit : str, optional
         As `read_markers` was given them for the original.
     joints : MarkerSequence, optional
-        Joint centres, which a C3D file gets as further points, computed and described as such.
+        Joint centres, in metres, written to a C3D file as further points, marked as computed.
 
     Raises
     ------
     MarkerFileError
-        A name that ends in neither, an original that is no C3D file or has other frames or labels.
+        A name with another ending, an original that is no C3D file or has other frames or labels.
+
+    Examples
+    --------
+    >>> from tempfile import mkdtemp
+    >>> still = MarkerSequence(np.zeros((3, 2, 3)) + 0.5, ("C7", "T10"), 120.0)
+    >>> places = still.positions
+    >>> clean = MarkerArtefacts((), (), places, still.labels, still, np.ones((3, 2)), places, np.tile([0, 1], (3, 1)))
+    >>> write_virtual(mkdtemp() + "/virtual.csv", clean)
+
+    [MoSh]
     """
     path, sequence = Path(path), artefacts.virtual()
     filled = ~artefacts.repaired.seen
@@ -193,23 +212,23 @@ def write_virtual(path: str | Path, artefacts: MarkerArtefacts, original: str | 
 
 def _add_joints(name: Path, file: Path, joints: MarkerSequence, subject_prefix: str | None, unit: str | None
                 ) -> None:
-    """Joint centres into a C3D file, under the name of the subject, if labels have one."""
+    """Add joint centres to a C3D file, under the name of the subject if its labels have one."""
     data = file.read_bytes()
     taken = point_table(name, data).labels
     who = (subject_prefix or "").split(",")[0]
     who = who or next((label.rpartition(":")[0] for label in taken if ":" in label), "")
     labels = unlike([f"{who}:{label}" if who else label for label in joints.labels], taken)
-    told = [f"joint centre of the model ({label})" for label in joints.labels]
+    descriptions = [f"joint centre of the model ({label})" for label in joints.labels]
     try:
-        file.write_bytes(add_points(name, data, labels, told, joints.positions, unit))
-    except MarkerFileError as error:                     # the markers are the user's, the joints can be had elsewhere
+        file.write_bytes(add_points(name, data, labels, descriptions, joints.positions, unit))
+    except MarkerFileError as error:                     # the markers matter more; the joints are in other files too
         say(f"virtual.c3d has no joint centres: {error}")
 
 
 def artefact_table(artefacts: MarkerArtefacts) -> dict[str, Any]:
-    """What was found, as numbers and text for a JSON file: exchanges, bad spans, and how much was filled.
+    """Return the artefacts as numbers and text for a JSON file: swaps, bad spans, and the number of filled frames.
 
-    Frames count from 0; both ends belong to a span. Distances are in metres.
+    Frames count from 0, and both ends belong to a span. Distances are in metres.
     """
     gone = ~artefacts.repaired.seen
     known = [artefacts.repaired.labels.index(label) for label in artefacts.labels]

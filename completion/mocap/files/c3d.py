@@ -1,4 +1,4 @@
-"""C3D, the file of motion-capture systems: read here, of every processor type; written through ezc3d.
+"""C3D files of motion-capture systems: read here, for all processor types; written with ezc3d.
 
 The reader is our own because ezc3d ends the process on some damaged files, reads truncated ones as shorter, and
 does not know big-endian ones.
@@ -20,37 +20,41 @@ from scanprep.geometry.format_common import UNITS, unit_named
 
 from .text import MarkerFileError, RawMarkers, distinct_labels
 
-BLOCK = 512
-_INTEL, _DEC, _MIPS = 84, 85, 86
-MOST_FRAMES = 65535                  # that the header can count: it means so many or more
+BLOCK = 512                          # bytes; the unit in which the format counts positions in a file
+_INTEL, _DEC, _MIPS = 84, 85, 86     # processor types, by the numbers of the format
+MOST_FRAMES = 65535                  # largest count in the header, which then means that many or more
 _Parameters = dict[tuple[str, str], list[Any]]                       # group and name -> values
 
 
-class _Damaged(Exception):
+class _DamagedError(Exception):
     """What is wrong with the file."""
 
 
 @dataclass(frozen=True)
 class _Numbers:
-    """How one processor stores its numbers."""
+    """Number formats of one processor type."""
 
     processor: int
 
     @property
     def order(self) -> str:
+        """Byte order, as numpy and struct write it."""
         return ">" if self.processor == _MIPS else "<"
 
     def words(self, data: bytes, kind: str) -> np.ndarray:
+        """Decode bytes as numbers of a numpy type."""
         return np.frombuffer(data, self.order + kind)
 
     def floats(self, data: bytes) -> np.ndarray:
+        """Decode bytes as floating-point numbers of 4 bytes."""
         if self.processor != _DEC:
             return self.words(data, "f4").astype(np.float64)
-        halves = np.frombuffer(data, "<u2").reshape(-1, 2)           # the upper half first, exponent larger by 2
+        # DEC floats have the upper half first, and an exponent larger by 2
+        halves = np.frombuffer(data, "<u2").reshape(-1, 2)
         return halves[:, ::-1].copy().view("<f4")[:, 0].astype(np.float64) / 4
 
     def encode(self, values: np.ndarray, kind: str) -> bytes:
-        """Numbers as bytes, floating-point ones ("f4") or whole ones ("i2")."""
+        """Encode numbers as bytes, floating-point ("f4") or integer ("i2")."""
         if kind == "f4" and self.processor == _DEC:
             return (4 * values.ravel()).astype("<f4").view("<u2").reshape(-1, 2)[:, ::-1].tobytes()
         return values.astype(self.order + kind).tobytes()
@@ -58,33 +62,33 @@ class _Numbers:
 
 @dataclass(frozen=True, eq=False)
 class PointTable:
-    """Where in a C3D file its points stand."""
+    """The layout of points in a C3D file."""
 
     numbers: _Numbers
-    labels: tuple[str, ...]          # of all points, those that hold no positions among them
+    labels: tuple[str, ...]          # of all points, including those that hold no positions
     kept: tuple[int, ...]            # the columns that hold positions
     start: int                       # byte of the first frame
-    width: int                       # bytes of each
+    width: int                       # bytes of each frame
     frames: int
-    scale: float                     # of whole numbers; negative where the file holds floating-point numbers
+    scale: float                     # factor on integers; negative where the file holds floating-point numbers
     rate: float | None
     unit: str
-    notes: tuple[str, ...]           # what the file says wrongly, and what was done
+    notes: tuple[str, ...]           # errors in the file, and how they were resolved
 
     @property
     def kind(self) -> str:
-        """Of a number, as numpy names it."""
+        """Type of a number, as numpy names it."""
         return "f4" if self.scale < 0 else "i2"
 
     def words(self, data: bytes) -> np.ndarray:
-        """The four numbers (T, L, 4) of all points: places as they stand there, cameras and residual in one."""
+        """Read the four numbers (T, L, 4) of all points: raw positions, and one number for cameras and residual."""
         body = data[self.start:self.start + self.frames * self.width]
         rows = self.numbers.floats(body) if self.kind == "f4" else self.numbers.words(body, "i2").astype(np.float64)
         return rows.reshape(self.frames, -1)[:, :4 * len(self.labels)].reshape(self.frames, len(self.labels), 4)
 
 
 def point_table(path: Path, data: bytes) -> PointTable:
-    """Where the points of a C3D file stand."""
+    """Find where the points of a C3D file are; MarkerFileError for a damaged file."""
     start = (data[0] - 1) * BLOCK if data else 0
     if len(data) < BLOCK or data[1] != 0x50:
         raise MarkerFileError(f"{path}: expected a C3D file, with byte 2 = 80 and a header of {BLOCK} bytes; "
@@ -98,14 +102,14 @@ def point_table(path: Path, data: bytes) -> PointTable:
                               f"found {numbers.processor}")
     try:
         return _table(data, file_parameters(data, numbers), numbers)
-    except _Damaged as problem:
+    except _DamagedError as problem:
         raise MarkerFileError(f"{path}: {problem}") from None
     except (struct.error, IndexError, ValueError, OverflowError) as error:
         raise MarkerFileError(f"{path}: damaged C3D file ({error})") from None
 
 
 def read_c3d(path: Path, data: bytes) -> RawMarkers:
-    """The points of a C3D file; missing are those with a negative residual."""
+    """Read the points of a C3D file; those with a negative residual are missing."""
     table = point_table(path, data)
     words = table.words(data)[:, list(table.kept)]
     positions = words[..., :3] * (1.0 if table.kind == "f4" else table.scale)
@@ -114,9 +118,9 @@ def read_c3d(path: Path, data: bytes) -> RawMarkers:
 
 
 def file_parameters(data: bytes, numbers: _Numbers) -> _Parameters:
-    """All parameters; a group is known by its number, which may come after its parameters."""
+    """Read all parameters; groups go by number, since a group may come after its parameters."""
     groups: dict[int, str] = {}
-    found: list[tuple[int, str, list[Any]]] = []
+    records: list[tuple[int, str, list[Any]]] = []
     room = len(data)                     # no byte belongs to two parameters
     for group, name, _, link, _ in parameter_records(data, numbers):
         if group < 0:
@@ -129,25 +133,25 @@ def file_parameters(data: bytes, numbers: _Numbers) -> _Parameters:
         size = abs(kind) * math.prod(dims)
         raw = data[begin:begin + size]
         if len(raw) < size:
-            raise _Damaged("truncated: the C3D parameters end before they should")
+            raise _DamagedError("truncated: the C3D parameters end before they should")
         values: list[Any]
         if kind == -1:
             width = (dims[0] if dims else 1) or 1
             values = [raw[i:i + width].decode("latin-1").strip(" \0") for i in range(0, len(raw), width)]
         else:
             values = (numbers.floats(raw) if kind == 4 else numbers.words(raw, "i2" if kind == 2 else "i1")).tolist()
-        found.append((group, name, values))
+        records.append((group, name, values))
         room -= size
         if room < 0:
-            raise _Damaged("damaged: the C3D parameters lie over each other")
-    return {(groups.get(group, ""), name): values for group, name, values in found}
+            raise _DamagedError("damaged: the C3D parameters lie over each other")
+    return {(groups.get(group, ""), name): values for group, name, values in records}
 
 
 def parameter_records(data: bytes, numbers: _Numbers) -> Iterator[tuple[int, str, int, int, int]]:
-    """Group, negative for that of a group itself, name, where it begins, its link and the step there, of every record.
+    """Yield group (negative for a group itself), name, begin, position of the link, and its step, of every record.
 
-    They end where the third byte of the section says, or where the header has the points, whatever the last one links
-    to; its step is 0.
+    Records end where the third byte of the section says, or where the points begin, whatever the last one links to; the
+    step of the last one is 0.
     """
     begin = (data[0] - 1) * BLOCK
     place, points = begin + 4, (int(numbers.words(data[16:18], "u2")[0]) - 1) * BLOCK
@@ -164,28 +168,29 @@ def parameter_records(data: bytes, numbers: _Numbers) -> Iterator[tuple[int, str
 
 
 def _table(data: bytes, parameters: _Parameters, numbers: _Numbers) -> PointTable:
-    """Where the points stand, by the header, the parameters and the size of the file."""
+    """Find where the points are, from the header, the parameters and the size of the file."""
     start = (int(numbers.words(data[16:18], "u2")[0]) - 1) * BLOCK
     scale = float(numbers.floats(data[12:16])[0])
     if start < BLOCK or not np.isfinite(scale):
-        raise _Damaged(f"damaged: the header says that the points begin at byte {start}, their scale is {scale}")
+        raise _DamagedError(f"damaged: the header says that the points begin at byte {start}, their scale is {scale}")
     end = rotations_start(parameters, start, len(data)) or len(data)
     try:
         count, analog, frames, size, notes = _counts(data, parameters, numbers, scale, end - start)
-    except _Damaged:                     # perhaps it is the place of the rotations that is wrong
+    except _DamagedError:                     # the position of the rotations may be wrong: try without it
         end = len(data)
         count, analog, frames, size, notes = _counts(data, parameters, numbers, scale, end - start)
     width = (4 * count + analog) * size
-    if frames > MOST_FRAMES and frames == (end - start) // width:      # not those that only fill the last block
+    if frames > MOST_FRAMES and frames == (end - start) // width:      # drop zero frames that only fill the last block
         while end - start - frames * width < BLOCK and not any(data[start + (frames - 1) * width:][:width]):
             frames -= 1
     labels = [label or f"point{i}" for i, label in enumerate((_lists(parameters, "LABELS") + [""] * count)[:count])]
-    # stored among the points, but no positions
+    # outputs of the model that are stored among the points, but are no positions
     computed = {label for key in ("ANGLES", "FORCES", "MOMENTS", "POWERS", "SCALARS")
                 for label in parameters.get(("POINT", key), ())}
     kept = tuple(i for i, label in enumerate(labels) if label not in computed)
     described = [str(text) for text in _lists(parameters, "DESCRIPTIONS")]
     names, twice = distinct_labels(labels, described)
+    # rate and unit: the parameters first, then the header
     rates = [*parameters.get(("POINT", "RATE"), ()), *numbers.floats(data[20:24]).tolist()]
     said = str((parameters.get(("POINT", "UNITS")) or ["mm"])[0]).lower() or "mm"
     return PointTable(numbers, names, kept, start, width, frames, -abs(scale) if size == 4 else abs(scale),
@@ -195,15 +200,15 @@ def _table(data: bytes, parameters: _Parameters, numbers: _Numbers) -> PointTabl
 
 def _counts(data: bytes, parameters: _Parameters, numbers: _Numbers, scale: float, room: int
             ) -> tuple[int, int, int, int, tuple[str, ...]]:
-    """Points, analog values and frames, the bytes of a number, and what of it the header says otherwise.
+    """Find the numbers of points, analog values and frames, the bytes of a number, and notes on a wrong header.
 
-    Programs write some of these wrongly; the size of the file tells which. What the header says is taken where the
-    points end within a block of the end of the `room`, else the first of what else the file says that does, else what
-    the header says if there is room for it.
+    Some programs write some of these wrongly; the size of the file tells which. The header is right if the points end
+    within a block of the end of the `room`. Otherwise the first combination of other values in the file that does is
+    taken, or else the header's values if they fit.
     """
     _, header_count, header_analog, first, last = (int(n) for n in numbers.words(data[:10], "u2"))
     counts = list(dict.fromkeys([header_count, *_whole(parameters, "POINT", "USED")]))
-    # analog values a frame are channels times samples of each
+    # analog values per frame = channels times samples of each
     samples = [int(numbers.words(data[18:20], "u2")[0])]
     rates = [parameters.get((group, "RATE"), [0.0])[0] for group in ("ANALOG", "POINT")]
     if all(isinstance(rate, float | int) and 0 < rate < np.inf for rate in rates):
@@ -212,11 +217,13 @@ def _counts(data: bytes, parameters: _Parameters, numbers: _Numbers, scale: floa
     analogs = list(dict.fromkeys([header_analog, *(each * one for each in channels for one in samples)]))
     own = float(next(iter(parameters.get(("POINT", "SCALE"), ())), scale))
     sizes = list(dict.fromkeys([4 if scale < 0 else 2, 4 if own < 0 else 2]))
+    # no points at all: a file of rotations, or empty
     if not any(counts):
         turned = len(parameters.get(("ROTATION", "LABELS"), ())) or sum(_whole(parameters, "ROTATION", "USED"))
-        raise _Damaged(f"expected points, the C3D file holds rotations of {turned} segments and no markers, as "
+        raise _DamagedError(f"expected points, the C3D file holds rotations of {turned} segments and no markers, as "
                        "Theia3D writes them; export BVH in its place, for scape animate, or markers" if turned else
                        f"expected points, the C3D file holds 0 points in {max(last - first + 1, 0)} frames")
+    # all combinations that fit into the file
     fitting: list[tuple[int, int, int, int]] = []
     for count, analog, size in itertools.product(filter(None, counts), analogs, sizes):
         width = (4 * count + analog) * size
@@ -224,13 +231,15 @@ def _counts(data: bytes, parameters: _Parameters, numbers: _Numbers, scale: floa
                     if 0 < frames * width <= room]
     exact = [f for f in fitting if room - f[2] * (4 * f[0] + f[1]) * f[3] < BLOCK]
     usual = [f for f in fitting if (f[0], f[1], f[3]) == (counts[0], analogs[0], sizes[0])]
+    # none fits: the file is truncated
     if not exact and not usual:
         frames = _frames(parameters, first, last, 0)[0]
         if frames <= 0:
-            raise _Damaged(f"expected points, the C3D file holds {header_count} points in {frames} frames")
+            raise _DamagedError(f"expected points, the C3D file holds {header_count} points in {frames} frames")
         wanted = frames * (4 * counts[0] + analogs[0]) * sizes[0] + len(data) - room
-        raise _Damaged(f"truncated: expected {frames} frames in {wanted} bytes, found {len(data)} bytes")
+        raise _DamagedError(f"truncated: expected {frames} frames in {wanted} bytes, found {len(data)} bytes")
     count, analog, frames, size = (exact or usual)[0]
+    # notes where the header is wrong
     told = [(header_count, count, "points"), (header_analog, analog, "analog values a frame")]
     told += [(max(last - first + 1, 0), frames, "frames")] if last < MOST_FRAMES else []
     notes = [f"the header says {said} {what}; by the size of the file and its parameters there are {taken}"
@@ -241,19 +250,19 @@ def _counts(data: bytes, parameters: _Parameters, numbers: _Numbers, scale: floa
 
 
 def rotations_start(parameters: _Parameters, start: int, size: int) -> int:
-    """Byte of the rotations behind the points, which begin at `start`; 0 where there are none."""
+    """Return the byte of the rotations after the points, which begin at `start`; 0 where there are none."""
     place = BLOCK * (sum(_whole(parameters, "ROTATION", "DATA_START")) - 1)
     used = _whole(parameters, "ROTATION", "USED") or [len(parameters.get(("ROTATION", "LABELS"), ()))]
     return place if used[0] and start < place < size else 0
 
 
 def _whole(parameters: _Parameters, group: str, name: str) -> list[int]:
-    """The first value of a parameter as a count, if it is there."""
+    """Return the first value of a parameter as a count, in a list that is empty where it is missing."""
     return [int(value) & 0xFFFF for value in parameters.get((group, name), ())[:1] if isinstance(value, float | int)]
 
 
 def _frames(parameters: _Parameters, first: int, last: int, room: int) -> list[int]:
-    """How many frames there may be, the likeliest first: the header counts to 65535, longer files say it elsewhere."""
+    """Return possible numbers of frames, the likeliest first; beyond 65535 they are in parameters, not the header."""
     said = []
     ends = [parameters.get(("TRIAL", key), []) for key in ("ACTUAL_START_FIELD", "ACTUAL_END_FIELD")]
     if all(len(end) == 2 for end in ends):
@@ -268,13 +277,13 @@ def _frames(parameters: _Parameters, first: int, last: int, room: int) -> list[i
 
 
 def _lists(parameters: _Parameters, name: str) -> list[str]:
-    """The texts of all points of LABELS or DESCRIPTIONS; beyond 255 they go on in LABELS2, LABELS3, ..."""
+    """Read the texts of LABELS or DESCRIPTIONS; beyond 255 points they continue in LABELS2, LABELS3, ..."""
     lists = (parameters.get(("POINT", f"{name}{part}" if part > 1 else name)) for part in itertools.count(1))
     return [str(text) for some in itertools.takewhile(bool, lists) for text in some or ()]
 
 
 def step_of(path: Path, table: PointTable, frames: int, unit: str | None) -> float:
-    """Metres of a step of the numbers of a file, to which so many frames go; `unit` where it says its own wrongly."""
+    """Return metres per step of the file's numbers, for `frames` frames; `unit` replaces a wrong one in the file."""
     if frames != table.frames:
         raise MarkerFileError(f"{path}: expected a file of {frames} frames, found {table.frames}")
     if (unit or table.unit) not in UNITS:
@@ -284,11 +293,11 @@ def step_of(path: Path, table: PointTable, frames: int, unit: str | None) -> flo
 
 def replace_points(path: Path, data: bytes, columns: np.ndarray, positions: np.ndarray, source: np.ndarray,
                    unit: str | None = None) -> bytes:
-    """The file with other positions of some points; analog channels, events and all parameters are kept.
+    """Return the file with other positions of some points; analog channels, events and all parameters stay.
 
-    A measured point keeps its cameras and its residual, made no less than the least that the file can hold; a computed
-    one has neither, a missing one residual -1. `columns` (L,) are of the points with positions, `positions` (T, L, 3),
-    metres, `source` (T, L) the column a point was measured as, -1 if computed; `unit` of a file that says it wrongly.
+    A measured point keeps its cameras and its residual, which is raised to the least that the file can hold. A computed
+    point has neither, a missing one has residual -1. `columns` (L,) are among the points with positions, `positions`
+    are (T, L, 3), metres, `source` (T, L) is the column a point was measured as, -1 if computed.
     """
     table = point_table(path, data)
     scale = step_of(path, table, len(positions), unit)
@@ -298,12 +307,13 @@ def replace_points(path: Path, data: bytes, columns: np.ndarray, positions: np.n
     fresh = np.empty((*positions.shape[:2], 4))
     fresh[..., :3] = positions / scale
     old = np.take_along_axis(words[:, mine, 3], np.maximum(source, 0), axis=1)
-    residual = 256  # one step of the residual in the fourth number of a point; below it are cameras
+    residual = 256  # one step of the residual in the fourth number of a point; the lower byte has the cameras
     fresh[..., 3] = np.where(source < 0, 0.0, np.where(old < residual, old + residual, old))
     same = (source == np.arange(len(mine))) & (words[:, mine, 3] >= 0)
-    fresh[same, :3] = words[:, mine][same, :3]                         # not a bit of them changes
+    fresh[same, :3] = words[:, mine][same, :3]                         # unchanged, bit by bit
     fresh[np.isnan(positions[..., 0])] = [0, 0, 0, -1]
     if table.kind == "i2":
+        # integers; too large ones need a file of floating-point numbers
         fresh = np.rint(fresh)
         if not holds(fresh):
             return replace_points(path, as_floats(path, data), columns, positions, source, unit)
@@ -316,14 +326,14 @@ def replace_points(path: Path, data: bytes, columns: np.ndarray, positions: np.n
 
 
 def holds(points: np.ndarray) -> bool:
-    """Whether whole numbers of two bytes hold points (T, L, 4), in steps of the file's scale."""
+    """Tell whether 16-bit integers can hold points (T, L, 4), in steps of the file's scale."""
     return bool(np.abs(points).max(initial=0) <= 32767)
 
 
 def as_floats(path: Path, data: bytes) -> bytes:
-    """A file of whole numbers as the same with floating-point ones, which hold places however far; with a warning.
+    """Convert a file of integers to floating-point numbers, which hold any position; with a warning.
 
-    Points, analog values and parameters stay what they are; rotations behind the points are left out.
+    Points, analog values and parameters keep their values; rotations after the points are left out.
     """
     table = point_table(path, data)
     numbers, parameters = table.numbers, file_parameters(data, table.numbers)
@@ -336,6 +346,7 @@ def as_floats(path: Path, data: bytes) -> bytes:
     if unsigned:
         values[:, own:] = numbers.words(rows, "u2").reshape(table.frames, -1)[:, own:]
     values[:, :own] *= np.tile([table.scale] * 3 + [1.0], len(table.labels))
+    # a negative scale, in the header and in the parameters, marks floating-point numbers
     head = bytearray(data[:table.start])
     minus = numbers.encode(np.array([-abs(table.scale)]), "f4")
     head[12:16] = minus
@@ -351,7 +362,7 @@ def as_floats(path: Path, data: bytes) -> bytes:
 
 def write_c3d(path: Path, positions: np.ndarray, labels: tuple[str, ...], rate: float,
               filled: np.ndarray | None = None) -> None:
-    """Write positions (T, L, 3), metres, of which some, `filled` (T, L), were not measured."""
+    """Write positions (T, L, 3), metres; `filled` (T, L) marks those that were computed."""
     try:
         import ezc3d
     except ImportError:
@@ -362,10 +373,11 @@ def write_c3d(path: Path, positions: np.ndarray, labels: tuple[str, ...], rate: 
     parameters["RATE"]["value"] = [float(rate)]
     parameters["LABELS"]["value"] = tuple(labels)
     T, L = positions.shape[:2]
+    # positions in millimetres, homogeneous
     points = np.ones((4, L, T))
     points[:3] = 1000 * positions.transpose(2, 1, 0)
     tree["data"]["points"] = points
-    # residual, millimetres, of points that were measured, where others were not
+    # measured points have residual 1 mm where others were computed, which have 0
     residual = np.zeros((T, L)) if filled is None else np.where(filled, 0.0, 1.0)
     tree["data"]["meta_points"] = {"residuals": np.where(np.isnan(positions[..., 0]), -1.0, residual).T[None],
                                    "camera_masks": np.zeros((7, L, T), dtype=bool)}

@@ -1,4 +1,4 @@
-"""Files of marker sequences: C3D, TRC, CSV and TSV."""
+"""Marker sequences and their files: C3D, TRC, CSV and TSV."""
 from __future__ import annotations
 
 import warnings
@@ -24,19 +24,28 @@ __all__ = ["MarkerFileError", "MarkerSequence", "read_markers", "write_markers"]
 
 @dataclass(frozen=True, eq=False)
 class MarkerSequence:
-    """Markers on their way through time.
+    """Positions of labelled markers over time.
 
     Parameters
     ----------
     positions : (T, L, 3) float, metres
         NaN where a marker was not seen.
-    labels : L strings, each different
+    labels : sequence of L strings
+        All different.
     rate : float, frames per second
+        Above 0.
 
     Raises
     ------
     ValueError
         Shapes that do not agree, a label that comes twice, a rate that is not positive, an infinite position.
+
+    Examples
+    --------
+    >>> MarkerSequence(np.zeros((50, 2, 3)), ("C7", "T10"), 100.0)
+    MarkerSequence(50 frames of 2 markers at 100 Hz, 0% missing)
+
+    [MoSh]
     """
 
     positions: np.ndarray
@@ -68,16 +77,16 @@ class MarkerSequence:
 
     @property
     def seen(self) -> np.ndarray:
-        """(T, L) bool: where a marker was seen."""
+        """Mask (T, L) of where a marker was seen."""
         return ~np.isnan(self.positions[..., 0])
 
     @property
     def times(self) -> np.ndarray:
-        """(T,) seconds from the first frame."""
+        """Times (T,), seconds from the first frame."""
         return np.arange(len(self.positions)) / self.rate
 
     def select(self, labels: Sequence[str]) -> MarkerSequence:
-        """The markers of these labels, in this order.
+        """Return the markers of some labels, in that order.
 
         Raises
         ------
@@ -91,7 +100,7 @@ class MarkerSequence:
         return MarkerSequence(self.positions[:, columns], tuple(labels), self.rate)
 
     def frames(self, which: slice) -> MarkerSequence:
-        """A stretch of the sequence; a step in the slice lowers the rate."""
+        """Return a stretch of the sequence; a step in the slice lowers the rate."""
         step = which.step or 1
         if step < 1:
             raise ValueError(f"which: expected a slice that goes forward, got {which}")
@@ -100,31 +109,31 @@ class MarkerSequence:
 
 def read_markers(path: str | Path, unit: str | None = None, subject_prefix: str | None = None,
                  rate: float | None = None, usual_rate: float | None = None) -> MarkerSequence:
-    """Read a marker sequence.
+    """Read a marker sequence from a file.
 
-    What a file says wrongly of itself and what was done about it is told in a UserWarning each: another number of
-    frames, a label that comes twice, a number that stands for a marker that was not seen.
+    Errors in a file and how they were resolved are reported as a UserWarning each: a wrong number of frames, a label
+    that comes twice, a number that stands for a missing marker.
 
     Parameters
     ----------
     path : str or Path
         C3D; TRC; CSV as Motive exports it; TSV as Qualisys does; or CSV with the columns `time, LABEL_x, LABEL_y,
-        LABEL_z, ...`, an empty cell where a marker is missing. Instead of `time`, seconds, there may be `frame`; then
-        `rate` is needed.
+        LABEL_z, ...`, with empty cells where a marker is missing. Instead of `time`, in seconds, there may be `frame`;
+        then `rate` is needed.
     unit : 'm', 'mm', 'cm' or 'in', optional
-        Unit of the file. When it is not given: what the file says, or millimetres; metres for CSV.
+        Unit of the file. Without it: the unit in the file, or millimetres; metres for CSV.
     subject_prefix : str, optional
-        Whose markers, in a file with several people: labels read `Subject:Label` there. Several, `Head,Trunk`, are of
-        one person.
-    rate : float, optional
-        Frames per second, where the file does not say or says it wrongly.
-    usual_rate : float, optional
-        Frames per second to assume, with a warning, where the file does not say; without it such a file is refused.
+        Whose markers to read, in a file with several people: labels there are `Subject:Label`. Several prefixes,
+        `Head,Trunk`, are of one person.
+    rate : float, frames per second, optional
+        Needed where the file has none or a wrong one.
+    usual_rate : float, frames per second, optional
+        Assumed, with a warning, where the file has no rate; without it such a file is an error.
 
     Returns
     -------
     MarkerSequence
-        In metres, labels without `Subject:`.
+        Positions (T, L, 3) in metres, labels without `Subject:`.
 
     Raises
     ------
@@ -133,23 +142,29 @@ def read_markers(path: str | Path, unit: str | None = None, subject_prefix: str 
 
     Examples
     --------
-    >>> read_markers("walk.c3d", subject_prefix="Ann").labels[:2]
-    ('LFHD', 'RFHD')
+    >>> from tempfile import mkdtemp
+    >>> path = mkdtemp() + "/two_people.csv"
+    >>> write_markers(path, MarkerSequence(np.ones((9, 2, 3)), ("Ann:C7", "Bob:C7"), 100.0))
+    >>> read_markers(path, subject_prefix="Ann")
+    MarkerSequence(9 frames of 1 markers at 100 Hz, 0% missing)
+
+    [MoSh]
     """
     path = Path(path)
-    metres_of(unit)                      # another word is refused before the file is read
+    metres_of(unit)                      # an unknown unit is an error before the file is read
     raw = _read_raw(path)
     columns, labels = subject_columns(path, raw.labels, subject_prefix)
-    together, notes = people_of(raw.labels), list(raw.notes)
-    if subject_prefix is None and together and len(together[0]) > 1:
+    # several prefixes that are parts of one person are taken together, with a warning
+    people, notes = people_of(raw.labels), list(raw.notes)
+    if subject_prefix is None and people and len(people[0]) > 1:
         most = Counter(label.rpartition(":")[0] for label in raw.labels if ":" in label).most_common(1)[0][0]
-        notes.append(f"the labels of {', '.join(together[0])} are taken as those of one person; those of one only are "
+        notes.append(f"the labels of {', '.join(people[0])} are taken as those of one person; those of one only are "
                      f"taken with subject_prefix={most}")
     return _in_metres(path, raw, columns, labels, unit, rate, usual_rate, notes)
 
 
 def read_marker_points(path: str | Path, unit: str | None = None, rate: float | None = None) -> MarkerSequence:
-    """Read all points of a file, whoever's they are: labels as they stand there, with what is before a colon.
+    """Read all points of a file, of all people, with labels as they are in the file, prefixes included.
 
     Parameters
     ----------
@@ -163,8 +178,11 @@ def read_marker_points(path: str | Path, unit: str | None = None, rate: float | 
 
     Examples
     --------
-    >>> read_points("two_people.c3d").labels[:2]
-    ('Ann:LFHD', 'Ann:RFHD')
+    >>> from tempfile import mkdtemp
+    >>> path = mkdtemp() + "/two_people.csv"
+    >>> write_markers(path, MarkerSequence(np.ones((9, 2, 3)), ("Ann:C7", "Bob:C7"), 100.0))
+    >>> read_marker_points(path).labels
+    ('Ann:C7', 'Bob:C7')
     """
     path = Path(path)
     metres_of(unit)
@@ -174,7 +192,7 @@ def read_marker_points(path: str | Path, unit: str | None = None, rate: float | 
 
 def _in_metres(path: Path, raw: RawMarkers, columns: Sequence[int], labels: tuple[str, ...], unit: str | None,
                rate: float | None, usual_rate: float | None, notes: list[str]) -> MarkerSequence:
-    """Some columns of a file as a sequence; what was done about what it says wrongly is told."""
+    """Convert some columns of a file to a sequence in metres; errors of the file are reported as warnings."""
     own_unit = unit or unit_named(raw.unit)
     if own_unit is None:
         raise MarkerFileError(f"{path}: expected a unit of {', '.join(UNITS)}, found '{raw.unit}'; say unit=")
@@ -182,16 +200,17 @@ def _in_metres(path: Path, raw: RawMarkers, columns: Sequence[int], labels: tupl
         if usual_rate is None:
             raise MarkerFileError(f"{path}: expected the frames per second, it does not say them; say rate=")
         notes.append(f"it does not say its frames per second, {usual_rate:g} are assumed")
-    # not seen: 0 0 0, or one number three times, as 9999999, that lies beyond all places
+    # missing: 0 0 0, or one number three times, such as 9999999, that lies beyond all positions
     places = raw.positions[:, columns]
     places = np.where((places == 0).all(axis=2, keepdims=True), np.nan, places)
     same = (places == places[..., :1]).all(axis=2)
-    others = np.abs(places[~same & np.isfinite(places).all(axis=2)])
-    fill = same & (np.abs(places[..., 0]) > others.max(initial=0)) & bool(others.size)
+    largest = np.abs(places[~same & np.isfinite(places).all(axis=2)])
+    fill = same & (np.abs(places[..., 0]) > largest.max(initial=0)) & bool(largest.size)
     if fill.any():
         values = ", ".join(f"{value:.9g}" for value in np.unique(places[fill, 0])[:3])
         notes.append(f"{number_of(int(fill.sum()), 'position')} of {values} three times taken as missing")
         places = np.where(fill[..., None], np.nan, places)
+    # one warning for each note, then metres
     for note in notes:
         warnings.warn(f"{path}: {note}", stacklevel=3)
     positions = UNITS[own_unit] * places
@@ -205,11 +224,10 @@ def _in_metres(path: Path, raw: RawMarkers, columns: Sequence[int], labels: tupl
 
 
 def marker_subjects(path: str | Path) -> tuple[str, ...]:
-    """The people whose markers are in a file, by what stands before the colon of its labels.
+    """Return the people in a file, by the prefixes of its labels, before the colon.
 
-    None where there is no colon, nor where several prefixes are parts of one person, as `people_of` says. Beside
-    several people a prefix of fewer than eight labels, of which nobody else has one, is a prop: it is left out, with a
-    warning.
+    It is empty without a colon, and where several prefixes are parts of one person, see `people_of`. Beside several
+    people, a prefix with fewer than eight labels that nobody else has is a prop: it is left out, with a warning.
     """
     labels = _read_raw(Path(path)).labels
     people = tuple(prefixes[0] for prefixes in people_of(labels) if len(prefixes) == 1)
@@ -225,7 +243,7 @@ def marker_subjects(path: str | Path) -> tuple[str, ...]:
 
 
 def label_prefixes(path: str | Path) -> set[str]:
-    """What stands before the colon of the labels of a file; none of one that cannot be read."""
+    """Return the prefixes of a file's labels, before the colon; empty for a file that cannot be read."""
     try:
         labels = _read_raw(Path(path)).labels
     except MarkerFileError:
@@ -234,10 +252,10 @@ def label_prefixes(path: str | Path) -> set[str]:
 
 
 def people_of(labels: Sequence[str]) -> tuple[tuple[str, ...], ...]:
-    """The prefixes of each person's labels, `Subject:Label`.
+    """Group the prefixes of labels, `Subject:Label`, by person.
 
-    Where no bare label comes twice, prefixes are those of clusters, rigid bodies or a prop beside one person; where
-    some do, each prefix is that of a person.
+    Where no bare label comes twice, all prefixes belong to one person: clusters, rigid bodies or a prop. Where some
+    label comes twice, each prefix is a person.
 
     Examples
     --------
@@ -253,7 +271,7 @@ def people_of(labels: Sequence[str]) -> tuple[tuple[str, ...], ...]:
 
 
 def _read_raw(path: Path) -> RawMarkers:
-    """What a file holds, by its ending."""
+    """Read the content of a file, by its ending."""
     suffix = path.suffix.lower()
     data = storage.read_bytes(path, "a file of markers", MarkerFileError)
     if suffix not in READERS:
@@ -266,7 +284,7 @@ def _read_raw(path: Path) -> RawMarkers:
 
 def subject_columns(path: Path, labels: Sequence[str], subject_prefix: str | None
                     ) -> tuple[list[int], tuple[str, ...]]:
-    """Columns and bare labels of the only person, or of the prefixes that are named, with commas between several."""
+    """Return columns and bare labels of the only person, or of the named prefixes, separated by commas."""
     split = [label.rpartition(":") for label in labels]
     people = people_of(labels)
     known = {who for prefixes in people for who in prefixes}
@@ -284,20 +302,37 @@ def subject_columns(path: Path, labels: Sequence[str], subject_prefix: str | Non
 
 
 def write_markers(path: str | Path, sequence: MarkerSequence) -> None:
-    """Write a sequence, whole or not at all: `.csv` in metres, `.trc` or, single precision, `.c3d` in millimetres.
+    """Write a sequence to a file, which appears whole or not at all.
+
+    Parameters
+    ----------
+    path : str or Path
+        `.csv` in metres; `.trc` or, in single precision, `.c3d` in millimetres.
+    sequence : MarkerSequence
+        Positions (T, L, 3) in metres.
 
     Raises
     ------
     MarkerFileError
-        A name that ends in none of these.
+        A name with another ending.
+
+    Examples
+    --------
+    >>> from tempfile import mkdtemp
+    >>> path = mkdtemp() + "/still.trc"
+    >>> write_markers(path, MarkerSequence(np.ones((9, 2, 3)), ("C7", "T10"), 100.0))
+    >>> read_markers(path).labels
+    ('C7', 'T10')
+
+    [MoSh]
     """
     path = Path(path)
     suffix = path.suffix.lower()
     if suffix not in WRITTEN:
         raise MarkerFileError(f"{path}: expected a name ending in {', '.join(WRITTEN)}, found '{path.suffix}'")
-    told = sequence.positions, sequence.labels, sequence.rate
+    content = sequence.positions, sequence.labels, sequence.rate
     with storage.writing(path) as beside:
         if suffix == ".c3d":
-            write_c3d(beside, *told)
+            write_c3d(beside, *content)
         else:
-            beside.write_bytes(encode_csv(*told) if suffix == ".csv" else encode_trc(*told, path.name))
+            beside.write_bytes(encode_csv(*content) if suffix == ".csv" else encode_trc(*content, path.name))

@@ -1,4 +1,4 @@
-"""Files of a motion: tables of joint angles, joint centres and residuals, BVH and GLB."""
+"""Output files of a motion: tables of joint angles, joint centres and residuals, BVH and GLB."""
 from __future__ import annotations
 
 from collections.abc import Callable
@@ -22,17 +22,35 @@ from ...motion import Motion
 from .markers import MarkerSequence
 from .opensim import mask_unknown_centres, write_opensim
 
-KEYS = 240                           # frames of a GLB whose bodies are made one by one, where they change
+KEYS = 240                           # frames of a GLB whose bodies are made one by one, where the shape changes
 
 
 def joint_angles(motion: Motion) -> np.ndarray:
-    """(T, J, 3) rotation vectors in degrees: how every part is turned against its parent, the root in the world.
+    """Compute rotation vectors of every part relative to its parent, of the root in the world.
 
-    The vector's direction is the axis, along the axes of the template at rest, its length the angle. Of two vectors
-    for the same turn the one nearer to the frame before is taken, so that there are no jumps of a full turn.
+    The direction of a vector is the axis, in the axes of the template at rest; its length is the angle. Of the vectors
+    of one rotation, the nearest to the frame before is taken, so there are no jumps of a full turn.
+
+    Parameters
+    ----------
+    motion : Motion
+        Poses (T, J, 3) in radians.
+
+    Returns
+    -------
+    (T, J, 3) float, degrees
+
+    Examples
+    --------
+    >>> still = Motion(np.full((2, 16, 3), 0.1), np.zeros((2, 3)), None, 120.0, np.zeros((2, 0)))
+    >>> float(joint_angles(still)[1, 0, 0].round(2))
+    5.73
+
+    [SCAPE] §8
     """
     turns = motion.poses.copy()
     for t in range(1, len(turns)):
+        # add full turns about the axis until it is nearest to the frame before
         angle = np.linalg.norm(turns[t], axis=-1, keepdims=True)
         axis = turns[t] / np.maximum(angle, 1e-12)
         rounds = np.rint(((turns[t - 1] * axis).sum(axis=-1, keepdims=True) - angle) / (2 * np.pi))
@@ -41,21 +59,44 @@ def joint_angles(motion: Motion) -> np.ndarray:
 
 
 def joint_centres(motion: Motion, subject: Subject) -> np.ndarray:
-    """(T, J, 3) metres: where the joints are, as affine combinations of the surface around them, or the model's own."""
+    """Compute the joint centres of a motion.
+
+    They are affine combinations of the surface around the joints, or the model's own.
+
+    Parameters
+    ----------
+    motion : Motion
+        Poses (T, J, 3) in radians and trans (T, 3) in metres.
+    subject : Subject
+        The body that moves.
+
+    Returns
+    -------
+    (T, J, 3) float, metres
+
+    Examples
+    --------
+    >>> from model import load_built_in_model
+    >>> still = Motion(np.zeros((2, 16, 3)), np.zeros((2, 3)), None, 120.0, np.zeros((2, 0)))
+    >>> joint_centres(still, load_built_in_model().subject()).shape
+    (2, 16, 3)
+
+    [SCAPE] §4.2
+    """
     return subject.joints(motion.poses, motion.trans)
 
 
 def write_motion_folder(folder: Path, motion: Motion, subject: Subject, markers: MarkerSequence | None = None,
                         told: np.ndarray | None = None) -> None:
-    """motion.npz, .bvh, .trc and .mot, joint_angles.csv, joint_centres.csv and, of markers, residuals.csv; seconds.
+    """Write motion.npz, .bvh, .trc and .mot, joint_angles.csv, joint_centres.csv, and residuals.csv if there are any.
 
-    `markers`, of as many frames, go into the TRC. What is between parts of which the markers do not tell (`told` (J,)
-    bool) is an empty cell in tables and left out of the MOT.
+    `markers`, of as many frames, go into the TRC. Values between parts that the markers do not determine (`told` (J,)
+    bool) are empty cells in tables and left out of the MOT.
     """
     skeleton, T, centres = subject.skeleton, len(motion.poses), joint_centres(motion, subject)
     names, angles = skeleton.names, joint_angles(motion)
     if told is not None:
-        angles[:, ~(told & told[np.maximum(skeleton.parents, 0)])] = np.nan     # a guess if either side of it is one
+        angles[:, ~(told & told[np.maximum(skeleton.parents, 0)])] = np.nan     # unknown if either side is
     motion.save(folder / "motion.npz")
     write_motion_bvh(folder / "motion.bvh", motion, subject)
     write_numbers(folder / "joint_angles.csv", ["time", *(f"{name}_r{axis}" for name in names for axis in "xyz")],
@@ -68,14 +109,14 @@ def write_motion_folder(folder: Path, motion: Motion, subject: Subject, markers:
 
 
 def write_residuals(path: Path, motion: Motion) -> None:
-    """CSV: time in seconds, the mean of the frame, then every marker, metres; an empty cell where it was not seen."""
+    """Write residuals as CSV: time in seconds, mean of the frame, then every marker, metres; empty where not seen."""
     seen = np.isfinite(motion.residuals)
     mean = np.where(seen, motion.residuals, 0).sum(axis=1) / np.where(seen.any(axis=1), seen.sum(axis=1), np.nan)
     write_numbers(path, ["time", "mean", *motion.labels], np.c_[motion.times, mean, motion.residuals])
 
 
 def write_motion_bvh(path: Path, motion: Motion, subject: Subject) -> None:
-    """BVH in centimetres: the subject's bones at rest, of fixed length, and the motion."""
+    """Write a BVH in centimetres: the bones of the subject at rest, and the motion."""
     rest = subject.vertices(np.zeros((len(subject.skeleton.parents), 3)))
     skeleton = replace(subject.skeleton, joints=subject.joints(np.zeros((len(subject.skeleton.parents), 3))))
     write_bvh(path, skeleton, motion.poses, motion.trans, motion.rate, up=guess_upright(subject.template)[0],
@@ -84,10 +125,10 @@ def write_motion_bvh(path: Path, motion: Motion, subject: Subject) -> None:
 
 def write_glb(path: Path, motion: Motion, subject: Subject, bodies: Callable[[np.ndarray], np.ndarray] | None = None,
               colors: np.ndarray | None = None) -> list[Metric]:
-    """An animated GLB: the subject on its skeleton in every frame, with the correctives that skinning needs.
+    """Write an animated GLB: the subject skinned to its skeleton, with corrective shapes for what skinning misses.
 
-    `bodies` tells the vertices (n, N, 3), metres, of frames (n,) where the body changes or is smoothed: at most `KEYS`
-    of them are asked for; `colors` (N, 3) are of the vertices. Returned is how far the file is from the exact bodies.
+    `bodies` gives the vertices (n, N, 3), metres, of frames (n,) where the shape changes or is smoothed; at most `KEYS`
+    frames are requested. `colors` (N, 3) are of the vertices. Returned is the distance from the exact bodies.
     """
     rig, T = subject_rig(subject), len(motion.poses)
     if bodies is None:
@@ -95,7 +136,7 @@ def write_glb(path: Path, motion: Motion, subject: Subject, bodies: Callable[[np
     else:
         extra = body_correctives(rig, motion.poses, motion.trans, bodies, spread_indices(T, KEYS))
     rig = replace(rig, mesh=replace(rig.mesh, colors=colors), correctives=extra)
-    up, measured = guess_upright(subject.template)[0], spread_indices(T, 40)      # compared with the exact bodies
+    up, measured = guess_upright(subject.template)[0], spread_indices(T, 40)      # 40 frames to compare
     exact = motion.vertices(subject, measured) if bodies is None else bodies(measured)
     off = 1e3 * off_exact(rig, motion.poses, motion.trans, exact, measured)
     write_skinned_glb(path, aim_bones(rig, up), motion.poses, motion.trans, motion.rate, up)
@@ -104,5 +145,5 @@ def write_glb(path: Path, motion: Motion, subject: Subject, bodies: Callable[[np
 
 
 def write_numbers(path: Path, columns: list[str], rows: np.ndarray) -> None:
-    """Numbers as CSV, whole or not at all; NaN becomes an empty cell."""
+    """Write numbers as CSV, whole or not at all; NaN becomes an empty cell."""
     storage.write_file(path, tables.number_table(columns, rows))

@@ -1,7 +1,7 @@
-"""Files of a motion for OpenSim: motion.trc of markers and joint centres, motion.mot of joint angles.
+"""OpenSim files of a motion: motion.trc with markers and joint centres, motion.mot with joint angles.
 
-Both are in the axes of OpenSim's ground: y up, x where the person faces. Of the recording's own axes each is one, so
-numbers change places and signs and nothing else.
+Both are in the axes of OpenSim's ground: y up, x where the person faces. Each of these is an axis of the recording, so
+numbers only change places and signs.
 """
 from __future__ import annotations
 
@@ -24,15 +24,16 @@ from .markers import MarkerSequence, write_markers
 
 def write_opensim(folder: Path, motion: Motion, subject: Subject, centres: np.ndarray,
                   markers: MarkerSequence | None = None, told: np.ndarray | None = None) -> None:
-    """motion.trc with markers, if any, and joint centres (T, J, 3), metres; motion.mot if the body is a person's.
+    """Write motion.trc with markers, if any, and joint centres (T, J, 3), metres; motion.mot for a person's body.
 
-    Centres and angles between parts of which the markers do not tell (`told` (J,) bool) are left out.
+    Centres and angles between parts that the markers do not determine (`told` (J,) bool) are left out.
     """
     points = centre_sequence(mask_unknown_centres(centres, subject.skeleton, told), subject.skeleton, motion.rate)
     try:
         angles = anatomical_angles(motion, subject, centres, told)
     except ValueError as error:
         say(f"motion.mot is not written: {error}")
+        # without a person's parts the ground follows from how the body stands
         up, ahead = stance(subject.template, subject.skeleton.part_rotations(motion.poses)[:, 0])
         ground = ground_axes(np.stack([ahead, up, np.cross(ahead, up)], axis=1), np.eye(3)[None])
     else:
@@ -40,6 +41,7 @@ def write_opensim(folder: Path, motion: Motion, subject: Subject, centres: np.nd
         if angles.missing:
             say(f"motion.mot has no angles of {', '.join(angles.missing)}, for which this body has no parts")
         write_mot(folder / "motion.mot", angles, motion.rate)
+    # markers first, then joint centres with other labels
     labels, positions, rate = points.labels, points.positions, motion.rate
     if markers is not None:
         labels, rate = (*markers.labels, *unlike(labels, markers.labels)), markers.rate
@@ -48,13 +50,13 @@ def write_opensim(folder: Path, motion: Motion, subject: Subject, centres: np.nd
 
 
 def remove_distrusted(motion: Motion, markers: MarkerSequence) -> MarkerSequence:
-    """The markers of a motion without those that the body did not believe; unknown ones stay."""
+    """Return the markers of a motion with distrusted ones set to NaN; markers that are not in the layout stay."""
     doubted = np.isfinite(motion.residuals) & ~motion.trusted
     return MarkerSequence(np.where(doubted[..., None], np.nan, markers.positions), markers.labels, markers.rate)
 
 
 def unlike(labels: Sequence[str], others: Sequence[str]) -> list[str]:
-    """Labels with a `_`, or more, at the end of those that are among others, or came before."""
+    """Append `_` to labels until none is among `others` or comes twice."""
     out: list[str] = []
     for label in labels:
         while label in others or label in out:
@@ -64,22 +66,22 @@ def unlike(labels: Sequence[str], others: Sequence[str]) -> list[str]:
 
 
 def centre_sequence(centres: np.ndarray, skeleton: Skeleton, rate: float) -> MarkerSequence:
-    """Joint centres (T, J, 3), metres, as points: hip_r_joint, knee_r_joint, ..., others by the part that hangs there.
+    """Return joint centres (T, J, 3), metres, as markers: hip_r_joint, knee_r_joint, ..., others by their part.
 
-    The root has no joint and is left out.
+    The root has no joint, so it is left out.
     """
     return MarkerSequence(centres[:, 1:], centre_labels(skeleton), rate)
 
 
 def mask_unknown_centres(centres: np.ndarray, skeleton: Skeleton, told: np.ndarray | None) -> np.ndarray:
-    """Joint centres (T, J, 3) without, NaN, those between two parts of which the markers do not tell."""
+    """Set joint centres (T, J, 3) between two undetermined parts to NaN; `told` (J,) are the others."""
     if told is None:
         return centres
     return np.where((told | told[np.maximum(skeleton.parents, 0)])[:, None], centres, np.nan)
 
 
 def centre_labels(skeleton: Skeleton) -> tuple[str, ...]:
-    """(J - 1) names of the joints but the root's."""
+    """Return the names (J - 1) of all joints but the root's."""
     sided = {j: f"{role[2:]}_{role[0]}_joint" for role, j in
              find_numbered_roles(skeleton.names, skeleton.joints).items() if role[:2] in ("l_", "r_")}
     taken = [sided.get(j, f"{name}_joint") for j, name in enumerate(skeleton.names)][1:]
@@ -88,12 +90,13 @@ def centre_labels(skeleton: Skeleton) -> tuple[str, ...]:
 
 
 def write_mot(path: str | Path, angles: JointAngles, rate: float) -> None:
-    """Joint angles in degrees, and the middle of the hips in metres, as a motion file (Storage) of OpenSim."""
-    first = 3 if "pelvis_tilt" in angles.names else 0               # the angles of the pelvis stand before its place
+    """Write joint angles in degrees, and the middle of the hips in metres, as a Storage file of OpenSim."""
+    first = 3 if "pelvis_tilt" in angles.names else 0               # angles of the pelvis come before its position
     table = np.c_[np.arange(len(angles.degrees)) / rate, angles.degrees[:, :first], angles.pelvis,
                   angles.degrees[:, first:]]
     names = ("time", *angles.names[:first], "pelvis_tx", "pelvis_ty", "pelvis_tz", *angles.names[first:])
     axes = [f"{'-' if axis.sum() < 0 else '+'}{'xyz'[int(np.abs(axis).argmax())]}" for axis in angles.ground.T]
+    # the header of the format, with remarks
     lines = [Path(path).stem, "version=1", f"nRows={len(table)}", f"nColumns={len(names)}", "inDegrees=yes", "",
              "Angles are in degrees, pelvis_tx, pelvis_ty and pelvis_tz in metres.",
              f"Axes x, y, z are {', '.join(axes)} of the recording.",

@@ -1,7 +1,7 @@
-"""Marker sequences as text, TRC and CSV, and what all readers of marker files share.
+"""Marker sequences as text, TRC and CSV, and what all readers of marker files have in common.
 
-Files are read as programs and spreadsheets write them: the lines are counted, not what the header says of their
-number, and every difference is a note.
+Files are read as programs and spreadsheets write them: lines are counted, whatever the header says, and every
+difference becomes a note.
 """
 from __future__ import annotations
 
@@ -21,25 +21,25 @@ Rows = Sequence[tuple[int, Sequence[str]]]           # number and cells of each 
 
 
 class MarkerFileError(StorageError):
-    """A file of markers or of a marker layout that cannot be read: which one, what was expected, what came."""
+    """A file of markers or of a layout that cannot be read; the message says which, what was expected and found."""
 
 
 @dataclass(frozen=True, eq=False)
 class RawMarkers:
-    """What a marker file holds, in its own unit."""
+    """Content of a marker file, in its own unit."""
 
     positions: np.ndarray            # (T, L, 3) float, NaN where missing
-    labels: tuple[str, ...]          # L strings as they stand in the file, but each once
+    labels: tuple[str, ...]          # L strings as in the file, made distinct
     rate: float | None               # frames per second, or None where the file does not say
-    unit: str                        # as it stands in the file
-    notes: tuple[str, ...] = ()      # what the file says wrongly, and what was done
+    unit: str                        # as in the file
+    notes: tuple[str, ...] = ()      # errors in the file, and how they were resolved
 
 
 def distinct_labels(labels: Sequence[str], descriptions: Sequence[str] = ()) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """Labels of which none comes twice, and a note where some were changed.
+    """Make labels distinct, and return them with a note where some were changed.
 
-    A label that was there before becomes its description, as programs that cut labels to four letters keep the whole
-    name there, or else LABEL_2, LABEL_3, ...
+    A repeated label is replaced by its description, where programs that cut labels to four letters keep the full name.
+    Without a description it becomes LABEL_2, LABEL_3, ...
 
     Examples
     --------
@@ -50,6 +50,7 @@ def distinct_labels(labels: Sequence[str], descriptions: Sequence[str] = ()) -> 
     for i, label in enumerate(labels):
         name = label
         if label in times:
+            # the description, with the prefix of the person, then numbers
             who, colon, _ = label.rpartition(":")
             said = descriptions[i].strip() if i < len(descriptions) else ""
             name = f"{who}{colon}{said}" if said and ":" not in said else label
@@ -67,9 +68,9 @@ def distinct_labels(labels: Sequence[str], descriptions: Sequence[str] = ()) -> 
 
 
 def read_trc(path: Path, data: bytes) -> RawMarkers:
-    """A TRC file of Motion Analysis or OpenSim: empty cells and NaN are missing.
+    """Read a TRC file of Motion Analysis or OpenSim; empty cells and NaN are missing.
 
-    The names of line 4 say how many markers there are; trajectories without a name are left out.
+    The names in line 4 tell the number of markers; trajectories without a name are left out.
     """
     tabs = b"PathFileType\t" in data[:100].replace(b"\0", b"")
     separator, split = tables.table_rows(path, data, MarkerFileError, "\t" if tabs else ",;\t")
@@ -79,7 +80,7 @@ def read_trc(path: Path, data: bytes) -> RawMarkers:
                               f"of header, found {len(rows)} lines, first "
                               f"{' '.join(rows[0][1])[:30] if rows else ''!r}")
     keys, values = ([cell for cell in rows[k][1] if cell] for k in (1, 2))
-    # cells without anything separate here, and there stand for a value that is not said
+    # in some files empty cells only separate, in others they stand for a missing value
     said = dict(zip(map(str.lower, keys), values if len(values) == len(keys) else rows[2][1], strict=False))
     try:
         cells = [said.get(key, "") for key in ("datarate", "numframes", "nummarkers")]
@@ -88,6 +89,7 @@ def read_trc(path: Path, data: bytes) -> RawMarkers:
     except ValueError:
         raise MarkerFileError(f"{path}: line {rows[2][0]}: expected values of DataRate, NumFrames and NumMarkers, "
                               f"found {' '.join(rows[2][1])[:60]!r}") from None
+    # the line of names, and the frames below it
     named = next((k for k, (_, cells) in enumerate(rows) if cells[0].lower().startswith("frame")), 3)
     body = rows[named + 1:]
     while body and not re.fullmatch(r"[-+]?\d+([.,]\d*)?(e[-+]?\d+)?", body[0][1][0].strip().lower()):    # X1 Y1 Z1 ...
@@ -95,6 +97,7 @@ def read_trc(path: Path, data: bytes) -> RawMarkers:
     if not body:
         raise MarkerFileError(f"{path}: truncated: expected frames below line {rows[named][0]}, found none")
     usual = Counter(len(cells) for _, cells in body).most_common(1)[0][0]
+    # the names, and the columns of the trajectories that have one
     columns, names = _find_named_columns(rows[named][1], count, usual)
     if not names:
         raise MarkerFileError(f"{path}: line {rows[named][0]}: expected marker names, found none")
@@ -106,7 +109,7 @@ def read_trc(path: Path, data: bytes) -> RawMarkers:
     if frames is not None and frames != len(table):
         notes.append(f"NumFrames says {frames:g}, there are {len(table)}")
     clocked = even_rate(table[:, 1]) if len(table) > 1 else None
-    # a fiftieth by which a rate and its times differ where one of them is wrong
+    # 0.02: with a larger relative difference between rate and times, the times are right
     if clocked is not None and (not rate or abs(clocked / rate - 1) > 0.02):
         notes.append(f"DataRate says {rate or 0:g} frames a second, the times {clocked:g}: the times are believed")
         rate = clocked
@@ -117,13 +120,14 @@ def read_trc(path: Path, data: bytes) -> RawMarkers:
 
 
 def _find_named_columns(cells: Sequence[str], count: float | None, usual: int) -> tuple[list[int], list[str]]:
-    """Which trajectories have a name, and their names, of the line with the names.
+    """Return which trajectories have a name, and their names, from the line with the names.
 
-    `count` is what the header says, `usual` how many cells a line has. Names may be separated by blanks.
+    `count` is the number in the header, `usual` the number of cells in a line. Names may be separated by blanks.
     """
     in_cells = [(k, name) for k, name in enumerate(cells[2:]) if name]
     text = "  ".join(cells)
     ways = [[name for _, name in in_cells], re.split(r"\s{2,}", text)[2:], text.split()[2:]]
+    # the way to split that gives the number of the header, else that fits the cells of a line
     names = next((way for way in ways if len(way) == count), None) \
         or next((way for way in ways if 3 * len(way) + 2 == usual), ways[0])
     if names is ways[0] and all(k % 3 == 0 for k, _ in in_cells):
@@ -132,10 +136,10 @@ def _find_named_columns(cells: Sequence[str], count: float | None, usual: int) -
 
 
 def encode_trc(positions: np.ndarray, labels: Sequence[str], rate: float, name: str) -> bytes:
-    """Positions (T, L, 3), metres, as a TRC file of this name, in millimetres, as OpenSim reads it.
+    """Encode positions (T, L, 3), metres, as a TRC file with this name, in millimetres, as OpenSim reads it.
 
-    A missing marker has empty cells; a label has `_` for blanks, which separate there. Lines of numbers end in a tab:
-    OpenSim counts an empty last cell only if there is one behind it.
+    A missing marker has empty cells. Blanks in labels become `_`, as they separate names there. Lines of numbers end
+    with a tab, because OpenSim counts an empty last cell only if a tab follows.
     """
     spelled = [re.sub(r"\s+", "_", label.strip()) or f"marker{i + 1}" for i, label in enumerate(labels)]
     T, L = positions.shape[:2]
@@ -150,9 +154,9 @@ def encode_trc(positions: np.ndarray, labels: Sequence[str], rate: float, name: 
 
 
 def csv_markers(path: Path, separator: str, rows: Rows) -> RawMarkers:
-    """The markers of a table with the columns `time` or `frame`, then `LABEL_x, LABEL_y, LABEL_z` of every marker.
+    """Read markers from a table with the columns `time` or `frame`, then `LABEL_x, LABEL_y, LABEL_z` of every marker.
 
-    Where semicolons or tabs separate, numbers may have decimal commas.
+    Numbers may have decimal commas where semicolons or tabs separate.
     """
     head = rows[0][1] if rows else []
     clock = [word for word in head if word.lower() in ("time", "frame")]
@@ -168,6 +172,7 @@ def csv_markers(path: Path, separator: str, rows: Rows) -> RawMarkers:
     table = table_numbers(path, rows[1:], len(head), separator)
     places = [i for i, word in enumerate(head) if word not in clock]
     rate = None
+    # the rate from the times, which must have even steps; name the first line that has not
     if "time" in columns:
         times = table[:, columns["time"]]
         rate = even_rate(times) if len(times) > 1 else 1.0
@@ -182,7 +187,7 @@ def csv_markers(path: Path, separator: str, rows: Rows) -> RawMarkers:
 
 
 def table_numbers(path: Path, rows: Rows, width: int, separator: str, fill: bool = False) -> np.ndarray:
-    """The numbers (T, width) of some lines, NaN for an empty cell and, if `fill`, where a line ends before."""
+    """Read numbers (T, width) from lines, NaN for an empty cell and, with `fill`, beyond the end of a short line."""
     table = np.full((len(rows), width), np.nan)
     for place, (number, cells) in zip(table, rows, strict=True):
         if len(cells) > width or (len(cells) < width and not fill):
@@ -195,14 +200,14 @@ def table_numbers(path: Path, rows: Rows, width: int, separator: str, fill: bool
 
 
 def even_rate(times: np.ndarray) -> float | None:
-    """Frames per second of times, at least two; None where they are not evenly spaced."""
+    """Compute frames per second from times, at least two; None where they are not evenly spaced."""
     typical = (times[-1] - times[0]) / (len(times) - 1)
     even = typical > 0 and (np.abs(np.diff(times) - typical) <= 0.5 * typical).all()
     return round(1 / typical, 6) if even else None
 
 
 def encode_csv(positions: np.ndarray, labels: Sequence[str], rate: float) -> bytes:
-    """Positions (T, L, 3), metres, as the CSV that `csv_markers` reads."""
+    """Encode positions (T, L, 3), metres, as the CSV that `csv_markers` reads."""
     rows = np.column_stack([np.arange(len(positions)) / rate, positions.reshape(len(positions), -1)])
     header = ["time", *(f"{label}_{axis}" for label in labels for axis in "xyz")]
     return tables.number_table(header, rows, "%.9g").encode()

@@ -1,4 +1,4 @@
-"""Which point is which marker, in every frame: by the votes of tracks, or by where a body has its markers."""
+"""Assign points to markers in every frame: by the votes of tracks, or by the simulated markers of a body."""
 from __future__ import annotations
 
 import numpy as np
@@ -9,26 +9,26 @@ from .body_search import assign_columns
 from .follow_points import forbid
 from .tracks import mean_along_tracks
 
-# cost of a marker without a point, and the most that one away from its place counts, in half squared deviations
+# Costs in half squared deviations: of a marker without a point, and the largest of a point far from its marker.
 ALONE, AWAY = 6.0, 8.0
-WINDOW = 0.25                        # seconds to either side over which a track is judged
-MISSING = 0.3                        # share of frames below which a marker is sought elsewhere on its part of the body
+WINDOW = 0.25                        # seconds to either side over which costs of a track are averaged
+MISSING = 0.3                        # a marker found in a smaller share of frames is searched elsewhere on its part
 
 
 def elect(votes: np.ndarray, tracks: np.ndarray) -> np.ndarray:
-    """The column (T, L) of each marker, -1 without one, where each track has the label most key frames gave it."""
+    """Give each track the label with most votes of key frames; return the column (T, L) of each marker, -1 without."""
     L = votes.shape[1] - 1
     share = (votes / np.maximum(votes.sum(axis=1, keepdims=True), 1))[:, :L]
     columns = np.full((len(tracks), L), -1)
     for t, row in enumerate(tracks):
         seen = np.flatnonzero(row >= 0)
-        chosen, _ = assign_columns(-share[row[seen]].T, -0.5)                   # no label without half of the votes
+        chosen, _ = assign_columns(-share[row[seen]].T, -0.5)                   # a label needs half of the votes
         columns[t, chosen >= 0] = seen[chosen[chosen >= 0]]
     return columns
 
 
 def label_of_track(columns: np.ndarray, tracks: np.ndarray) -> np.ndarray:
-    """The label (K,) that each track mostly has in columns (T, L), -1 without one."""
+    """Return the most frequent label (K,) of each track in columns (T, L), -1 without one."""
     L = columns.shape[1]
     counts = np.zeros((tracks.max() + 1, L), dtype=int)
     frames, rows = np.nonzero(columns >= 0)
@@ -38,10 +38,10 @@ def label_of_track(columns: np.ndarray, tracks: np.ndarray) -> np.ndarray:
 
 def assign_by_places(points: np.ndarray, tracks: np.ndarray, known: np.ndarray, places: np.ndarray, rate: float,
                      sd: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The column (T, L) of each marker by where a body has them in every frame, and how sure that is (T, L).
+    """Assign points by simulated markers; return the column (T, L) of each marker and its confidence (T, L).
 
-    What a point costs as a marker, half its squared deviations, is averaged along its track; then every frame is
-    matched by itself. So a track may be cut, exchanged and joined, where that is what the body says for a while.
+    The cost of a point as a marker, half its squared deviations, is averaged along its track. Then every frame is
+    matched by itself. So tracks may be cut, exchanged and joined where the body says so for a while.
 
     Parameters
     ----------
@@ -52,8 +52,9 @@ def assign_by_places(points: np.ndarray, tracks: np.ndarray, known: np.ndarray, 
     places : (T, L, 3) float, metres
     rate : float, frames per second
     sd : (L,) float, metres
-        How far each marker lies from its place, in each direction.
+        Standard deviation of each marker from its place, in each direction.
     """
+    # costs of all points as all markers, averaged along tracks
     T, L = places.shape[:2]
     costs = np.full((*tracks.shape, L), AWAY)
     for some in batches(T):
@@ -68,7 +69,7 @@ def assign_by_places(points: np.ndarray, tracks: np.ndarray, known: np.ndarray, 
         chosen, _ = assign_columns(cost, ALONE)
         rows = np.flatnonzero(chosen >= 0)
         columns[t, rows] = seen[chosen[rows]]
-        # the next best: this point as another marker, another point as this marker, or none
+        # confidence beside the next best: this point as another marker, another point as this marker, or none
         here = cost[rows, chosen[rows]]
         others = cost.copy()
         others[rows, chosen[rows]] = np.inf
@@ -80,10 +81,10 @@ def assign_by_places(points: np.ndarray, tracks: np.ndarray, known: np.ndarray, 
 
 def mean_offsets(points: np.ndarray, columns: np.ndarray, places: np.ndarray, turns: np.ndarray
                  ) -> tuple[np.ndarray, np.ndarray]:
-    """Median offsets (L, 3), metres, of the labelled points from places (T, L, 3), in the axes of their parts.
+    """Compute median offsets (L, 3), metres, of labelled points from places (T, L, 3), in the axes of their parts.
 
-    And how far (L,) they lie from there, a standard deviation of each direction. Both are zero for markers that fewer
-    frames than `MISSING` have.
+    Returned with them are standard deviations (L,) in each direction. Both are zero for markers that are in fewer
+    frames than `MISSING`.
     """
     L = columns.shape[1]
     offsets, deviations = np.zeros((L, 3)), np.zeros(L)
@@ -92,26 +93,26 @@ def mean_offsets(points: np.ndarray, columns: np.ndarray, places: np.ndarray, tu
         off = points[t, columns[t, row]] - places[t, row]
         local = np.einsum("tji,tj->ti", turns[t, row], off)
         offsets[row] = np.median(local, axis=0)
-        # of a distance in space the median is 1.54 standard deviations
+        # 1.54: median of a distance in space over the standard deviation of a coordinate
         deviations[row] = np.median(np.linalg.norm(local - offsets[row], axis=1)) / 1.54
     return offsets, deviations
 
 
 def find_displaced(points: np.ndarray, columns: np.ndarray, places: np.ndarray, turns: np.ndarray, part: np.ndarray
                    ) -> np.ndarray:
-    """Offsets (L, 3), metres, of markers that are worn elsewhere on their part of the body, in the part's own axes.
+    """Find misplaced markers on their part of the body; return offsets (L, 3), metres, in the axes of the part.
 
-    Markers that hardly any frame has are sought among the points without a label: where some keep their place on the
-    part in most frames, within `REACH` of the usual places, they are these markers. Of several each is the nearest to
-    where the layout has it, moved as the other markers of the part are.
+    Markers that are in few frames are searched among unlabelled points. Points that keep a place on the part in most
+    frames, near the usual places, are these markers. Several are matched to their usual places, moved like the other
+    markers of the part.
 
     Parameters
     ----------
     points : (T, C, 3) float, metres
     columns : (T, L) int
-        Of the markers that are labelled.
+        Columns of the labelled markers.
     places : (T, L, 3) float, metres
-        Where the body has the markers.
+        Simulated markers.
     turns : (T, L, 3, 3) float
         Rotations of their parts.
     part : (L,) int
@@ -120,37 +121,37 @@ def find_displaced(points: np.ndarray, columns: np.ndarray, places: np.ndarray, 
     free = np.isfinite(points[..., 0])
     frames, rows = np.nonzero(columns >= 0)
     free[frames, columns[frames, rows]] = False
-    # in which it is sought, at most
-    some = np.unique(np.linspace(0, len(points) - 1, 300).astype(int))
+    # at most 300 frames are searched
+    sampled = np.unique(np.linspace(0, len(points) - 1, 300).astype(int))
     missing = (columns >= 0).mean(axis=0) < MISSING
     (usual, _), offsets = mean_offsets(points, columns, places, turns), np.zeros((columns.shape[1], 3))
-    reach = 0.25  # metres from its usual place within which it is sought
+    reach = 0.25  # metres from its usual place within which a marker is searched
     for of in np.unique(part[missing]):
-        mine, known = np.flatnonzero(missing & (part == of)), np.flatnonzero(~missing & (part == of))
+        lost, labelled = np.flatnonzero(missing & (part == of)), np.flatnonzero(~missing & (part == of))
         # everything in the axes of the part, from the first of its missing markers
-        R, origin = turns[some, mine[0]], places[some, mine[0]]
-        wanted = np.einsum("tji,tlj->tli", R, places[some][:, mine] - origin[:, None]).mean(axis=0)
-        wanted += np.median(usual[known], axis=0) if len(known) else 0.0
-        frame, column = np.nonzero(free[some])
-        local = np.einsum("nji,nj->ni", R[frame], points[some[frame], column] - origin[frame])
+        R, origin = turns[sampled, lost[0]], places[sampled, lost[0]]
+        wanted = np.einsum("tji,tlj->tli", R, places[sampled][:, lost] - origin[:, None]).mean(axis=0)
+        wanted += np.median(usual[labelled], axis=0) if len(labelled) else 0.0
+        frame, column = np.nonzero(free[sampled])
+        local = np.einsum("nji,nj->ni", R[frame], points[sampled[frame], column] - origin[frame])
         near = (np.linalg.norm(local[:, None] - wanted, axis=2) < reach).any(axis=1)
-        # share of frames in which a point has to be there
-        found = _steady_places(local[near], frame[near], 0.5 * len(some))
+        # 0.5: least share of frames with a point at the place
+        found = _steady_places(local[near], frame[near], 0.5 * len(sampled))
         if len(found):
             apart = np.linalg.norm(wanted[:, None] - found, axis=2)
             for row, place in zip(*linear_sum_assignment(apart), strict=True):
                 if apart[row, place] < reach:
-                    begin = np.einsum("tji,tj->ti", R, places[some, mine[row]] - origin).mean(axis=0)
-                    offsets[mine[row]] = found[place] - begin
+                    begin = np.einsum("tji,tj->ti", R, places[sampled, lost[row]] - origin).mean(axis=0)
+                    offsets[lost[row]] = found[place] - begin
     return offsets
 
 
 def _steady_places(local: np.ndarray, frame: np.ndarray, often: float) -> np.ndarray:
-    """The places (n, 3) within `TIGHT` of which so many frames (N,) have one of the points (N, 3)."""
+    """Find places (n, 3) with a point (N, 3) nearby in at least `often` frames (N,)."""
     places = list[np.ndarray]()
     while len(local):
         tries = local[:: max(1, len(local) // 500)]
-        # metres within which it keeps its place on the part
+        # 3 cm: radius within which a marker keeps its place on the part
         close = ((tries[:, None] - local)**2).sum(axis=-1) < 0.03**2
         counts = [len(np.unique(frame[each])) for each in close]
         best = close[int(np.argmax(counts))]
@@ -162,6 +163,6 @@ def _steady_places(local: np.ndarray, frame: np.ndarray, often: float) -> np.nda
 
 
 def take_columns(points: np.ndarray, columns: np.ndarray) -> np.ndarray:
-    """The points (T, L, 3) in some columns (T, L), NaN where that is -1."""
+    """Return the points (T, L, 3) in some columns (T, L), NaN where the column is -1."""
     taken = np.take_along_axis(points, np.maximum(columns, 0)[..., None], axis=1)
     return np.where((columns < 0)[..., None], np.nan, taken)

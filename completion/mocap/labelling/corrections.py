@@ -1,4 +1,4 @@
-"""The table of labels: one row for each stretch of a track with one label, to be corrected and given back."""
+"""The table of labels: a row for each stretch of a track with one label, which the user can correct and return."""
 from __future__ import annotations
 
 from collections.abc import Sequence
@@ -16,7 +16,7 @@ COLUMNS = ("track", "point", "begin", "end", "label", "confidence", "fixed")
 
 def write_labels(path: Path, points: Sequence[str], tracks: np.ndarray, rows: np.ndarray, names: Sequence[str],
                  confidence: np.ndarray, fixed: np.ndarray) -> None:
-    """Write the label of every track, a row for each stretch that has one, the least certain first.
+    """Write a table of the labels of all tracks, a row for each stretch, the least confident first.
 
     Parameters
     ----------
@@ -33,6 +33,7 @@ def write_labels(path: Path, points: Sequence[str], tracks: np.ndarray, rows: np
     fixed : (T, C) bool
         Labels that were known.
     """
+    # all points, sorted by track and frame, and cut where track, label or `fixed` changes
     frames, columns = np.nonzero(tracks >= 0)
     number, label = tracks[frames, columns], rows[frames, columns]
     order = np.lexsort((frames, number))
@@ -40,24 +41,24 @@ def write_labels(path: Path, points: Sequence[str], tracks: np.ndarray, rows: np
     certain, known = confidence[frames, columns], fixed[frames, columns]
     edges = np.flatnonzero((np.diff(number) != 0) | (np.diff(label) != 0) | (np.diff(known.astype(int)) != 0)) + 1
     out = []
-    for some in np.split(np.arange(len(frames)), edges):
-        if not len(some):
+    for stretch in np.split(np.arange(len(frames)), edges):
+        if not len(stretch):
             continue
-        row, first, last = int(label[some[0]]), some[0], some[-1]
+        row, first, last = int(label[stretch[0]]), stretch[0], stretch[-1]
         out.append((int(number[first]), points[columns[first]], int(frames[first]), int(frames[last]),
-                    names[row] if row >= 0 else "", round(float(certain[some].mean()), 3) if row >= 0 else "",
+                    names[row] if row >= 0 else "", round(float(certain[stretch].mean()), 3) if row >= 0 else "",
                     "yes" if known[first] else ""))
     out.sort(key=lambda each: (each[5] == "", each[5] if each[5] != "" else 0.0, each[0], each[2]))
     tables.write_table(path, COLUMNS, out)
 
 
 def read_corrections(path: Path, tracks: np.ndarray, names: Sequence[str]) -> np.ndarray:
-    """What a table of labels says for certain (T, C), in the rows that are `fixed`, as `label_markers` takes it.
+    """Read the known labels (T, C) from the `fixed` rows of a table of labels, as `label_markers` takes them.
 
     Parameters
     ----------
     path : Path
-        As of `write_labels`, with labels changed and `yes` in the column fixed.
+        File of `write_labels`, with changed labels and `yes` in the column `fixed`.
     tracks : (T, C) int
         Those of the same recording.
     names : strings
@@ -84,6 +85,7 @@ def read_corrections(path: Path, tracks: np.ndarray, names: Sequence[str]) -> np
         if label and label not in names:
             raise StorageError(f"{path}: line {line}: expected a label of the layout or nothing, found '{label}'; it "
                                f"has {', '.join(names)}")
+        # the frames have to be those of the track
         here = tracks == track
         frames = np.flatnonzero(here.any(axis=1))
         if not {begin, end} <= set(frames.tolist()) or begin > end:
@@ -96,7 +98,7 @@ def read_corrections(path: Path, tracks: np.ndarray, names: Sequence[str]) -> np
             raise StorageError(f"{path}: line {line}: expected one label for track {track} in {begin} to {end}, an "
                                "earlier line has fixed another")
         known[here] = meant
-    # one label twice in a frame cannot be
+    # a label may occur only once in a frame
     for marker, name in enumerate(names):
         twice = np.flatnonzero((known == marker).sum(axis=1) > 1)
         if len(twice):

@@ -1,4 +1,4 @@
-"""Labels for markers without names: which point of every frame is which marker of a body."""
+"""Label unlabelled markers: find which point of every frame is which marker of a body."""
 from __future__ import annotations
 
 import warnings
@@ -26,42 +26,42 @@ from .layout_order import order_by_layout
 from .separate import separate_people
 from .tracks import link_points
 
-UNKNOWN, GHOST = -1, -2              # in labels that are known: nothing is, and: this point is no marker
-FEWEST = 10                          # points in a frame, of which no body can be told otherwise
-STARTS = 5                           # frames in which the body is sought
-# metres that half of a frame's points are from their middle at least and at most: 0.4 to 0.6 of one person
+UNKNOWN, GHOST = -1, -2              # known labels: none for this point; a ghost marker that belongs to no body
+FEWEST = 10                          # least points of a frame; fewer do not determine a body
+STARTS = 5                           # frames in which the body is searched
+# Limits in metres on the median distance of points from their middle; one person has 0.4 to 0.6.
 SPREAD = 0.1, 5.0
-FOUND = 0.3                          # misfit of a frame above which no body was found; right ones had at most 0.18
-# metres from its place that a marker lies at least, in each direction, of the three passes at last
+FOUND = 0.3                          # largest misfit of a frame with a body; correct bodies had at most 0.18
+# Least standard deviation, metres, of a marker from its place in each direction, in the last three passes.
 DEVIATIONS = (0.03, 0.02, 0.012)
-SURE = 0.9                           # confidence below which a label is doubted
-POSES = AnimateConfig(marker_sd=0.007)                                  # metres: markers where they sit, as in `mosh`
+SURE = 0.9                           # confidence below which a label is doubtful
+POSES = AnimateConfig(marker_sd=0.007)                                  # metres: markers at known places, as in `mosh`
 
 
 @dataclass(frozen=True, eq=False)
 class LabelledMarkers:
-    """Which point is which marker.
+    """Labelled markers, and the body that they were found with.
 
     Attributes
     ----------
     markers : MarkerSequence
-        The markers of the layout that were found, in its order.
+        The markers of the layout, in its order.
     columns : (T, L) int
-        The column of the points that each of them is, in every frame; -1 without one.
+        Column of the point of each marker in every frame; -1 without one.
     confidence : (T, L) float
-        Of each label, 0 to 1; 0 without a point.
+        Confidence of each label, 0 to 1; 0 without a point.
     unlabelled : (T, C) bool
-        Points that are no marker of this body.
+        Points that are not markers of this body.
     tracks : (T, C) int
-        The track of every point, -1 without one.
+        Track of every point, -1 without one.
     motion : Motion
-        Of the body that the labels were found with.
+        Motion of the body that the labels were found with.
     subject : Subject
-        That body: the one that was given, or the one that was found.
+        That body, known before or found.
     layout : MarkerLayout
-        Where the markers sit on it.
+        Places of the markers on it.
     person : PersonFit or None
-        Who was found, where the shape was not known.
+        The fit of the person, where the shape was not known.
     """
 
     markers: MarkerSequence
@@ -76,12 +76,13 @@ class LabelledMarkers:
 
     @property
     def judgement(self) -> Judgement:
-        """What the labels are worth: how many points have one, how sure they are, and how the body fits."""
+        """Judgement of the labels: share of labelled points, confidence, and fit of the body."""
         there = self.columns >= 0
         doubted = float((self.confidence[there] < SURE).mean()) if there.any() else 1.0
         alone = float(self.unlabelled.sum() / max((self.tracks >= 0).sum(), 1))
         residual = float(np.nanmedian(self.motion.residuals)) if there.any() else np.inf
         bad, check = [], []
+        # 40 mm from the body: wrong layout or person; 2% doubtful labels or 10% unlabelled points: a doubt
         if residual > 0.04:
             bad.append(f"labelled points lie {1000 * residual:.0f} mm from the body: another layout or person?")
         if doubted > 0.02:
@@ -93,24 +94,30 @@ class LabelledMarkers:
 
 def label_markers(model: BodyModel | Subject, points: MarkerSequence, layout: MarkerLayout,
                   known: np.ndarray | None = None, progress: Progress | None = None) -> LabelledMarkers:
-    """Find the label of every point in every frame, from nothing but where the points are.
+    """Find the label of every point in every frame, from the positions of the points alone.
 
-    Points are joined to tracks as far as their motion tells. In a few frames the body is sought in many poses and
-    turns; from the best it goes both ways through key frames, which vote for the labels of tracks. These labels tell
-    the person's shape, marker places and motion, and the body with its own markers says anew which point is which.
+    Points are joined to tracks as far as their motion tells. In a few frames the body is searched in many poses and
+    orientations. From the best frame it is followed in both directions through key frames, which vote for the labels of
+    tracks. These labels give the person's shape, marker places and motion. The body with its own markers then labels
+    the points again.
 
     Parameters
     ----------
     model : BodyModel or Subject
-        Of a person of unknown shape a model with betas; of a known one the subject, with the layout as worn.
+        A model with betas for an unknown person; a subject, with its own layout, for a known one.
     points : MarkerSequence
-        Its labels are not looked at. Columns may be tracks, or shuffled in every frame.
+        Positions (T, C, 3) in metres; labels are ignored. Columns may be tracks, or shuffled in every frame.
     layout : MarkerLayout
-        Where markers sit. Those that are not in the recording stay without points.
+        Where markers sit. Markers that are not in the recording stay without points.
     known : (T, C) int, optional
-        Labels that are known: the row of the layout that a point is, `GHOST` for a point that is no marker, `UNKNOWN`.
+        Known labels: the row of the layout for each point, `GHOST` for a point that is no marker, else `UNKNOWN`.
     progress : callable, optional
         Called with (done, total).
+
+    Returns
+    -------
+    LabelledMarkers
+        Labelled markers (T, L, 3) in metres, columns (T, L), confidence (T, L), and the motion.
 
     Raises
     ------
@@ -119,10 +126,15 @@ def label_markers(model: BodyModel | Subject, points: MarkerSequence, layout: Ma
 
     Examples
     --------
-    >>> points = read_markers("raw.c3d")
-    >>> layout, _ = choose_layout(model, "cmu41", ())
-    >>> label_markers(model, points, layout).markers.labels[:2]
-    ('LFHD', 'RFHD')
+    >>> from completion import load_layout
+    >>> from model import load_built_in_model
+    >>> model = load_built_in_model()
+    >>> layout = load_layout("cmu41", model.template, np.array(model.info["people_vertices"]))
+    >>> raw = MarkerSequence(np.stack([layout.place(model.template)[::-1]] * 2), [f"*{i}" for i in range(41)], 120.0)
+    >>> label_markers(model.subject(), raw, layout).columns[0].tolist() == list(range(41))[::-1]
+    True
+
+    [SCAPE] §8
     """
     return label_people([(model, layout)], points, known, progress)[0]
 
@@ -130,30 +142,49 @@ def label_markers(model: BodyModel | Subject, points: MarkerSequence, layout: Ma
 @one_thread()
 def label_people(people: Sequence[tuple[BodyModel | Subject, MarkerLayout]], points: MarkerSequence,
                  known: np.ndarray | None = None, progress: Progress | None = None) -> list[LabelledMarkers]:
-    """The same for several people in one volume, each with a model or a subject, and a layout.
+    """Label the markers of several people in one volume.
 
-    All markers of all people compete for the points of a frame, so that none takes what is another's.
+    All markers of all people compete for the points of a frame, so no point gets two labels.
 
     Parameters
     ----------
     people : sequence of (BodyModel or Subject, MarkerLayout)
+        One for each person, as for `label_markers`.
     points : MarkerSequence
+        Positions (T, C, 3) in metres; labels are ignored.
     known : (T, C) int, optional
-        As of `label_markers`; rows of the layouts are counted on from person to person.
+        As for `label_markers`; rows of the layouts are numbered through all people.
     progress : callable, optional
         Called with (done, total).
+
+    Returns
+    -------
+    list of LabelledMarkers
+        One for each person.
 
     Raises
     ------
     ValueError
-        As of `label_markers`; no frame in which the people stand apart.
+        As for `label_markers`; no frame in which the people stand apart.
+
+    Examples
+    --------
+    >>> from completion import load_layout
+    >>> from model import load_built_in_model
+    >>> model = load_built_in_model()
+    >>> layout = load_layout("cmu41", model.template, np.array(model.info["people_vertices"]))
+    >>> raw = MarkerSequence(np.stack([layout.place(model.template)] * 2), layout.labels, 120.0)
+    >>> [one.columns.shape for one in label_people([(model.subject(), layout)], raw)]
+    [(2, 41)]
+
+    [SCAPE] §8
     """
     tell = progress or (lambda done, total: None)
     at, rate, T = points.positions, points.rate, len(points.positions)
     known = _check_known(known, points, sum(len(layout.labels) for _, layout in people))
     tracks = link_points(at, rate)
 
-    # key frames, from one in which the bodies are found: mean people, or those who are known
+    # find the bodies, mean people or known ones, in one frame, follow them through key frames, and let these vote
     bodies = [_Person.start(model, layout) for model, layout in people]
     searches = [BodySearch(body.marked, body.subject) for body in bodies]
     first, placements = find_start(searches, at, lambda done: tell(done, 4 * T))
@@ -164,7 +195,7 @@ def label_people(people: Sequence[tuple[BodyModel | Subject, MarkerLayout]], poi
     columns = elect(count_votes(keys, found, tracks.max() + 1), tracks)
     columns, found = _in_order(bodies, columns, keys, found)
 
-    # the same by the people themselves
+    # the same with the fitted people, from the solutions so far
     bodies = [body if isinstance(model, Subject) else _find_person(body, model, at, mine, rate)
               for body, (model, _), mine in zip(bodies, people, _of_each(bodies, columns), strict=True)]
     searches = [BodySearch(body.marked, body.subject) for body in bodies]
@@ -173,10 +204,10 @@ def label_people(people: Sequence[tuple[BodyModel | Subject, MarkerLayout]], poi
     columns = elect(count_votes(keys, found, tracks.max() + 1), tracks)
     columns, found = _in_order(bodies, columns, keys, found)
 
-    # the motion of each tells the labels anew, and these the person, ever closer
+    # three passes: motion, then labels by the simulated markers, with ever smaller deviations
     told = np.full_like(columns, -2)
     for i, sd in enumerate(DEVIATIONS):
-        # share of labels that may change without the person being found anew
+        # 0.001: share of changed labels above which the person is fitted again
         changed = (columns != told).mean() > 0.001
         told = columns
         for k, mine in enumerate(_of_each(bodies, columns)):
@@ -186,7 +217,7 @@ def label_people(people: Sequence[tuple[BodyModel | Subject, MarkerLayout]], poi
         moving = [body.follow(at, mine, rate) for body, mine in zip(bodies, _of_each(bodies, columns), strict=True)]
         places = np.concatenate([one.places for one in moving], axis=1)
         turns = np.concatenate([one.turns for one in moving], axis=1)
-        # markers keep their places on these parts, wherever the fitted layout has them
+        # usual offsets of markers from their simulation, in the axes of their parts; new places of displaced markers
         part = np.concatenate([body.part + 1000 * k for k, body in enumerate(bodies)])
         offsets, deviations = mean_offsets(at, columns, places, turns)
         offsets = offsets + find_displaced(at, columns, places, turns, part)
@@ -194,6 +225,7 @@ def label_people(people: Sequence[tuple[BodyModel | Subject, MarkerLayout]], poi
         columns, sure = assign_by_places(at, tracks, known, places, rate, np.clip(deviations, sd, DEVIATIONS[0]))
         tell((i + 2) * T, (len(DEVIATIONS) + 1) * T)
 
+    # what is left has no label
     unlabelled = points.seen.copy()
     frames, rows = np.nonzero(columns >= 0)
     unlabelled[frames, columns[frames, rows]] = False
@@ -205,7 +237,7 @@ def label_people(people: Sequence[tuple[BodyModel | Subject, MarkerLayout]], poi
 
 @dataclass(frozen=True, eq=False)
 class _Person:
-    """A person, the usual layout, and markers on the body as far as they are known."""
+    """A person, the usual layout, and the body with markers, as known so far."""
 
     subject: Subject
     layout: MarkerLayout
@@ -215,19 +247,19 @@ class _Person:
 
     @property
     def part(self) -> np.ndarray:
-        """(L,) the part that carries each marker."""
+        """Part (L,) that carries each marker."""
         return self.subject.skeleton.part_of_vertex(self.subject.template)[self.layout.nearest]
 
     @staticmethod
     def start(model: BodyModel | Subject, layout: MarkerLayout) -> _Person:
-        """The mean person of a model, or the one that is known."""
+        """Start with the mean person of a model, or with a known person."""
         if isinstance(model, Subject):
             return _Person(model, layout, layout, _own(model, layout))
         subject = model.subject()
         return _Person(subject, layout, layout, mean_person(subject, layout))
 
     def follow(self, points: np.ndarray, columns: np.ndarray, rate: float) -> _Moving:
-        """The motion by the labels that columns (T, L) give."""
+        """Compute the motion for the labels in columns (T, L)."""
         motion = animate(self.subject, _sequence(points, columns, self.layout, rate), self.layout, POSES)
         x = self.marked.body.join(motion.poses, motion.trans)
         turns = self.marked.shapes.rotations(np.swapaxes(motion.poses, 0, 1))[self.part]
@@ -236,7 +268,7 @@ class _Person:
 
 @dataclass(frozen=True, eq=False)
 class _Moving:
-    """A motion, places (T, L, 3) of markers in it, metres, and rotations (T, L, 3, 3) of the parts that carry them."""
+    """A motion, its simulated markers (T, L, 3), metres, and rotations (T, L, 3, 3) of their parts."""
 
     motion: Motion
     places: np.ndarray
@@ -244,7 +276,7 @@ class _Moving:
 
 
 def _find_person(person: _Person, model: BodyModel, points: np.ndarray, columns: np.ndarray, rate: float) -> _Person:
-    """A person of unknown shape by the labels that columns (T, L) give."""
+    """Fit a person of unknown shape for the labels in columns (T, L)."""
     fit = find_person(model, _sequence(points, columns, person.usual, rate), person.usual)
     subject = model.subject(fit.betas)
     return _Person(subject, fit.layout, person.usual, _own(subject, fit.layout), fit)
@@ -252,19 +284,20 @@ def _find_person(person: _Person, model: BodyModel, points: np.ndarray, columns:
 
 def _in_order(bodies: Sequence[_Person], columns: np.ndarray, keys: Sequence[KeyFrame],
               found: Sequence[Solutions | None]) -> tuple[np.ndarray, list[Solutions | None]]:
-    """Columns (T, L) and solutions with labels put back that were exchanged throughout among the markers of a part."""
+    """Correct labels in columns (T, L) and solutions that were exchanged throughout among the markers of a part."""
     orders = []
     for k, body in enumerate(bodies):
         part, marked = body.part, body.marked
         solved = [solutions[k] for solutions in found if solutions is not None]
         pose, _, _ = marked.body.split(np.stack([one.x for one in solved]))
+        # mean offset of each marker in the axes of its part, over the key frames
         turns = marked.shapes.rotations(np.swapaxes(pose, 0, 1))[part]                            # (L, K, 3, 3)
         off = np.stack([np.where(one.matches[:, None] >= 0, one.off, np.nan) for one in solved])
         local = np.einsum("lkji,klj->kli", turns, off)
-        # share of key frames in which a marker has to be for its place to be told
+        # 0.1: least share of key frames with the marker
         enough = np.isfinite(local[..., 0]).mean(axis=0) > 0.1
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore", RuntimeWarning)                # a marker that was never seen
+            warnings.simplefilter("ignore", RuntimeWarning)                # for markers that were never seen
             places = body.layout.place(body.subject.template) + np.nanmedian(local, axis=0)
         places[~enough] = np.nan
         orders.append(order_by_layout(places, body.usual.place(body.subject.template), part))
@@ -277,7 +310,7 @@ def _in_order(bodies: Sequence[_Person], columns: np.ndarray, keys: Sequence[Key
 
 def find_start(searches: Sequence[BodySearch], points: np.ndarray, tell: Callable[[int], None]
                ) -> tuple[int, list[Placement]]:
-    """The frame, of a few well seen ones, in which the bodies fit best, and where they are there."""
+    """Find the frame, among a few full ones, in which the bodies fit best, and their placements there."""
     seen = np.isfinite(points[..., 0])
     full = np.flatnonzero(seen.sum(axis=1) >= max(FEWEST, 0.9 * seen.sum(axis=1).max()))
     frames = full[np.unique(np.linspace(0, len(full) - 1, STARTS + 2).round().astype(int)[1:-1])]
@@ -286,7 +319,7 @@ def find_start(searches: Sequence[BodySearch], points: np.ndarray, tell: Callabl
         frames, groups = separate_people(points[full], len(searches))
         frames = full[frames]
     tried = list[tuple[int, list[Placement]]]()
-    # of them, in which it is sought lying or upside down, if it stands nowhere
+    # upright first; lying or upside down only if no frame has a standing body
     for axes, count in ((UPS, len(frames)), (OTHERS, 2)):
         for i, (t, group) in enumerate(zip(frames[:count], groups[:count], strict=True)):
             tried.append((int(t), [search.find(some, axes) for search, some in zip(searches, group, strict=True)]))
@@ -301,7 +334,7 @@ def find_start(searches: Sequence[BodySearch], points: np.ndarray, tell: Callabl
 
 
 def _check_known(known: np.ndarray | None, points: MarkerSequence, count: int) -> np.ndarray:
-    """What is known of the points (T, C), and that there are enough of them."""
+    """Check the known labels (T, C), and that points are enough and of a person's size."""
     most = int(points.seen.sum(axis=1).max(initial=0))
     if most < FEWEST:
         raise ValueError(f"points: expected a frame with at least {FEWEST} points, the best has {most}")
@@ -319,14 +352,15 @@ def _check_known(known: np.ndarray | None, points: MarkerSequence, count: int) -
 
 
 def _of_each(bodies: Sequence[_Person], values: np.ndarray) -> list[np.ndarray]:
-    """The columns of an array (T, L) of all markers that are each person's."""
+    """Split an array (T, L) of all markers into those of each person."""
     return np.split(values, np.cumsum([len(body.layout.labels) for body in bodies])[:-1], axis=1)
 
 
 def _own(subject: Subject, layout: MarkerLayout) -> MarkedBody:
-    """A known person with the markers where they sit."""
+    """Return a known person with its markers."""
     return MarkedBody(subject, layout, AnimateConfig.prior_weight, AnimateConfig.prior_shrinkage)
 
 
 def _sequence(points: np.ndarray, columns: np.ndarray, layout: MarkerLayout, rate: float) -> MarkerSequence:
+    """Return the points in columns (T, L) as a sequence with the labels of a layout."""
     return MarkerSequence(take_columns(points, columns), layout.labels, rate)

@@ -1,4 +1,4 @@
-"""What `scape mosh` was called with, kept in its output, so that the same can be done again with another layout."""
+"""The arguments of `scape mosh`, stored in its output, so that it can run again with a corrected layout."""
 from __future__ import annotations
 
 from collections.abc import Mapping
@@ -19,7 +19,7 @@ from .recordings import Actor, Grouping, find_actors
 
 @dataclass(frozen=True, eq=False)
 class Models:
-    """The model and its name for reports, those of `female` and `male` people, if any, and a character, if any."""
+    """The model and its name, the models of `female` and `male` people, if any, and a character, if any."""
 
     neutral: BodyModel
     name: str
@@ -29,7 +29,7 @@ class Models:
 
 @dataclass(frozen=True)
 class MoshCall(KeptCall):
-    """The arguments of `scape mosh`, but who does the work."""
+    """The arguments of `scape mosh`, without those about workers."""
 
     command: ClassVar[str] = "scape mosh"
     may_be_files: ClassVar[tuple[str, ...]] = ("layout", "subjects")
@@ -45,11 +45,11 @@ class MoshCall(KeptCall):
     config: MoshConfig = field(default_factory=MoshConfig)
 
     def actors(self, output: Path) -> list[Actor]:
-        """The people of the recordings as they are now."""
+        """Return the people of the recordings that are there now."""
         return find_actors(self.markers, Grouping.of(self.subjects), output)
 
     def models(self) -> Models:
-        """All that was named, read."""
+        """Load all models that were named; UsageError for a number other than none, one or three."""
         loaded, name = read_model(self.model[0] if self.model else None)
         if len(self.model) not in (0, 1, 3):
             raise UsageError("--model: expected one, or three of both sexes, of women and of men, got "

@@ -86,12 +86,12 @@ def mosh_markers(markers: MarkersArg, output: Output, model: Models = (), layout
 
 
 def carry_out(call: MoshCall, space: Workspace, workers: Workers, command: str, *tell: Progress) -> Outcome:
-    """Do what has changed of a call in an output that is open; `tell` is the progress of people, and inside one."""
+    """Run what has changed of a call in an open output; `tell` reports progress over people, and within one."""
     actors, loaded = call.actors(space.folder), call.models()
     work = MoshTask(loaded.neutral, loaded.name, loaded.sexes, loaded.character,
                     None if call.layout is None else choose_layout(loaded.neutral, call.layout, ()), call.hold_out,
                     call.unit, call.rate, call.unlabelled, call.config, command)
-    # who is who into subjects.csv; one that was mended stays as it is, and has to be named
+    # write the grouping to subjects.csv; one that the user edited stays, and has to be named with --subjects
     table = space.folder / TABLE
     if not table.exists() or space.is_ours(TABLE):
         with space.staging("people") as staged:
@@ -100,11 +100,13 @@ def carry_out(call: MoshCall, space: Workspace, workers: Workers, command: str, 
         warnings.warn(f"{table}: left as it was mended", stacklevel=2)
     else:
         raise ValueError(f"{table}: was mended; go by it with --subjects {table}, or move it away")
+    # say who is who, for 20 people and 4 files of each
     for actor in actors[:20]:
         files, more = ", ".join(r.path.name for r in actor.recordings[:4]), len(actor.recordings) - 4
         say(f"{actor.name}: {files}{f' and {more} more' if more > 0 else ''} ({actor.rule})")
     if len(actors) > 20:
         say(f"and {len(actors) - 20} more people")
+    # the work, then table, page and judgement
     done = space.run(work, [Task(actor.name, actor, actor.name) for actor in actors], workers, *tell)
     results = Results({name: rows for name, (rows, _) in done.values.items()},
                       {name: line if line.startswith(f"{name}: ") else f"{name}: {line}"
@@ -117,7 +119,7 @@ def carry_out(call: MoshCall, space: Workspace, workers: Workers, command: str, 
 
 
 def describe(call: MoshCall, model: str, actors: Sequence[Actor]) -> FolderCommand:
-    """What is told of the people of a call; `model` is its name."""
+    """Return the wording of table and page for the people of a call; `model` is its name."""
     rules = {actor.name: actor.rule for actor in actors}
 
     def lines(name: str, rows: Sequence[Metric]) -> list[str]:
@@ -132,7 +134,7 @@ def describe(call: MoshCall, model: str, actors: Sequence[Actor]) -> FolderComma
 
 
 def _summary(results: Results, count: int) -> list[Metric]:
-    """The rows of the closing table: those of one person, or means over several."""
+    """Return the rows of the closing table: those of one person, or means over several."""
     before = len(results.values) - len(results.fresh)
     if count == 1 and results.values:
         (name, only), = results.values.items()

@@ -1,4 +1,4 @@
-"""A result of `scape mosh` in the browser: the markers on the body, those worst first, put right, and run again."""
+"""Correct the markers of a `scape mosh` result in the browser, the worst first, and run it again."""
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
@@ -33,7 +33,7 @@ from .work import ERRORS
 
 @dataclass(frozen=True, eq=False)
 class Result:
-    """What a folder holds: figures of the people, those worst first, and the layout as it was used."""
+    """The content of a result folder: figures, people, the worst first, and the layout that was used."""
 
     call: MoshCall
     rows: dict[str, list[Metric]]
@@ -43,7 +43,8 @@ class Result:
 
     @staticmethod
     def read(folder: Path, call: MoshCall) -> Result:
-        """That of a folder, which need not be open."""
+        """Read the result of a folder, which need not be open."""
+        # people with results, in the order of the page
         models, kept = call.models(), Workspace(folder, folder / HOME)
         names = set(kept.list_results(""))
         actors = [actor for actor in call.actors(folder) if actor.name in names]
@@ -53,9 +54,8 @@ class Result:
                              call.rate)
         return Result(call, rows, people, _usual(call, models.neutral, people), models.neutral.template)
 
-
     def figures(self, name: str) -> list[Metric]:
-        """How far the markers of a person are from the body: all of them, and those that are believed."""
+        """Return distances of a person's markers from the body: of all, and of those that are trusted."""
         off = next(one.off for one in self.people if one.name == name)
         known = [1000 * far for far in off.values() if np.isfinite(far)] or [np.nan]
         return [Metric("distance of all markers, mean", float(np.mean(known)), "mm"),
@@ -64,11 +64,11 @@ class Result:
 
 
 class MoshApp(ResultsApp):
-    """The state of the page on which a result of `scape mosh` is mended.
+    """State of the page on which a result of `scape mosh` is corrected.
 
-    The first pane is the layout on the model's template, the second a person at rest with the markers where they were
-    found, which are moved, exchanged or taken away; the third a frame of the person. ValueError for a folder that
-    does not tell what it was made from.
+    The first pane shows the layout on the model's template. The second shows a person at rest with the markers as they
+    were found; here they are moved, exchanged or removed. The third shows a frame. ValueError for a folder without the
+    arguments of its call.
     """
 
     name, title = "mosh", "Mend markers"
@@ -80,11 +80,11 @@ class MoshApp(ResultsApp):
         super().__init__(self.template, self.scans, (), fixed=self.template.places)
 
     def read_results(self) -> Result:
-        """What the folder holds now, of the call that was made last."""
+        """Read what the folder holds now, for the last call."""
         return Result.read(self.folder, MoshCall.read(self.folder))
 
     def show_results(self, results: Result) -> None:
-        """The same person and marker as before, with nothing to undo."""
+        """Show new results for the same person and marker, with nothing to undo."""
         person = self.person.name
         self._begin_with(results)
         self.done.clear()
@@ -94,7 +94,7 @@ class MoshApp(ResultsApp):
         self.choose_next(self.chosen)
 
     def _begin_with(self, result: Result) -> None:
-        """A result, and corrections that were not run yet."""
+        """Start with a result, and with corrections that were not run yet."""
         self.result, self.file = result, next_file(self.folder, result.call.layout)
         self.spots = changes(result.usual, MarkerLayout.load(self.file)) if self.file.exists() else {}
         self.template = Clicked(Path("layout"), self.file, surface=Clickable(result.template))
@@ -105,13 +105,13 @@ class MoshApp(ResultsApp):
 
     @property
     def person(self) -> FoundPerson:
-        """That is shown."""
+        """The person that is shown."""
         return self.result.people[self.current]
 
     # what the page is sent
 
     def scene(self) -> Message:
-        """The layout, the person at rest, and a frame."""
+        """Return the panes: the layout, the person at rest, and a frame."""
         assert self.scan is not None, "a result is of somebody"
         frame = self.person.worst[self.frame]
         panes = [replace(self.template.pane("the layout"), label="where the layout has them"),
@@ -119,11 +119,11 @@ class MoshApp(ResultsApp):
         return Message("scene", {}, pack_scene(panes))
 
     def judgements(self) -> Iterable[Judgement | None]:
-        """Of the people."""
+        """Return the judgement of every person."""
         return (judgement_of(self.result.rows[one.name]) or Judgement() for one in self.result.people)
 
     def more(self) -> dict[str, Any]:
-        """What is to be thought of people, markers and frames; and the figures of the run before."""
+        """Return doubts about markers, the frames, and figures beside those of the run before."""
         person = self.person
         before = {m.name: m.text() for m in self.before.get(person.name, [])}
         changed = [label for label in person.names if self._own(label) in self.spots]
@@ -135,14 +135,14 @@ class MoshApp(ResultsApp):
                          for m in self.result.figures(person.name)]}
 
     def choose_next(self, last: str | None, pane: int = SCAN) -> None:
-        """The marker stays the same: at first the worst."""
+        """Keep the chosen marker; at first choose the worst."""
         self.names = tuple(self.person.names)
         self.chosen = last if last in self.names else self.names[0]
 
     # what the page sends
 
     def on_open(self, send: Send, scan: int) -> None:
-        """Another person; bodies of people are no files that could be read again, so none is forgotten."""
+        """Show another person; unlike scans, people are not read again."""
         if not 0 <= scan < len(self.scans):
             raise ValueError(f"person: expected 0 to {len(self.scans) - 1}, got {scan}")
         if scan != self.current:
@@ -151,28 +151,28 @@ class MoshApp(ResultsApp):
             send(self.scene())
 
     def on_frame(self, send: Send, frame: int) -> None:
-        """Another of the worst frames."""
+        """Show another of the worst frames."""
         if not 0 <= frame < len(self.person.worst):
             raise ValueError(f"frame: expected 0 to {len(self.person.worst) - 1}, got {frame}")
         self.frame = frame
         send(self.scene())
 
     def on_exchange(self, send: Send, name: str, other: str) -> None:
-        """Exchange two markers, whose labels were mixed up: each is where the layout has the other.
+        """Exchange two markers with mixed-up labels: each gets the layout's place of the other.
 
-        Not where the other was found, which by the wrong label is anywhere.
+        The places that were found do not count, as they belong to the wrong labels.
         """
         if name == other or not {name, other} <= set(self.person.names):
             raise ValueError("choose two markers of this person, to exchange them")
         self._change(self.current, {name: self._layout_place(other), other: self._layout_place(name)})
 
     def _layout_place(self, label: str) -> np.ndarray:
-        """Where the layout, as it is corrected by now, has a marker on the person that is shown."""
+        """Return the place of a marker in the layout, as corrected so far, on the shown person."""
         spot = self.spots.get(self._own(label)) or Spot.of(self.result.usual, self._own(label))
         return spot.on(self.person.body)
 
     def _spot(self, number: int, label: str, place: np.ndarray) -> Spot:
-        """A place as the layout will have it: that of one of its markers with all that it says of that."""
+        """Return a place for the layout: that of one of its markers with its distance, or the nearest on the skin."""
         person, usual = self.result.people[number], self.result.usual
         for spot in [*self.spots.values(), *(Spot.of(usual, other) for other in usual.labels)]:
             if spot is not None and np.array_equal(spot.on(person.body), place):
@@ -180,16 +180,16 @@ class MoshApp(ResultsApp):
         return Spot.at(person.skin, place, Spot.of(usual, self._own(label)).distance)
 
     def on_run(self, send: Send) -> None:
-        """The same call with the corrected layout."""
+        """Run the same call with the corrected layout."""
         if self.working is not None:
             return
         if not self.spots:
             raise ValueError("nothing was corrected: move, exchange or take away a marker first")
         call = replace(self.result.call, layout=str(self.file))
-        worn = {label for one in self.result.people for label in one.names}
-        # markers that a person needs
-        apply_corrections(self.result.usual, self.spots).match_labels(sorted(worn), 3)
-        # now, as they are worked out from files that the run writes anew
+        labels = {label for one in self.result.people for label in one.names}
+        # ValueError where the corrected layout keeps fewer than the 3 markers that a person needs
+        apply_corrections(self.result.usual, self.spots).match_labels(sorted(labels), 3)
+        # the figures of this run, before its files are replaced
         before = {one.name: self.result.figures(one.name) for one in self.result.people}
 
         mended = "scape mosh, mended in the browser"
@@ -204,19 +204,21 @@ class MoshApp(ResultsApp):
     # the state itself
 
     def _editable(self, pane: int) -> Clicked:
+        """Return the person for edits; the layout cannot be edited."""
         if pane != SCAN:
             raise ValueError("the first body shows the layout as it was; click on the person beside it")
         return super()._editable(pane)
 
     def _predict_if_time(self, send: Send, pane: int) -> None:
-        """Markers are not predicted."""
+        """Do nothing: markers are not predicted."""
 
     def _set(self, number: int, places: Mapping[str, np.ndarray | None]) -> None:
-        """Markers of a person elsewhere, and so of all, whose layout is one; the file is written at once."""
+        """Set places of markers for a person, and so for all, who share the layout; write the file at once."""
         person = self.result.people[number]
+        # a marker at its found place is no correction
         for label, place in places.items():
-            found = person.places.get(label)
-            if place is None if found is None else place is not None and np.array_equal(place, found):
+            original = person.places.get(label)
+            if place is None if original is None else place is not None and np.array_equal(place, original):
                 self.spots.pop(self._own(label), None)
             else:
                 self.spots[self._own(label)] = None if place is None else self._spot(number, label, place)
@@ -227,7 +229,7 @@ class MoshApp(ResultsApp):
             self.file.unlink(missing_ok=True)
 
     def _place(self) -> None:
-        """The markers of all people as they were found, but for those that were changed."""
+        """Show the markers of all people as they were found, with the corrections."""
         for person, scan in zip(self.result.people, self.scans, strict=True):
             scan.places = dict(person.places)
             for label in person.names:
@@ -237,12 +239,12 @@ class MoshApp(ResultsApp):
                         scan.places[label] = spot.on(person.body)
 
     def _own(self, label: str) -> str:
-        """The layout's name of a marker."""
+        """Return the layout's name of a marker."""
         return self.result.usual.aliases.get(label, label)
 
 
 def _usual(call: MoshCall, model: BodyModel, people: list[FoundPerson]) -> MarkerLayout:
-    """The layout that all people have in common, as it was before it was corrected here."""
+    """Return the layout that all people share, as it was before corrections; ValueError for several."""
     names = [call.layout] if call.layout else sorted({one.layout_name for one in people})
     if len(names) > 1:
         raise ValueError(f"the people of this folder wear different sets of markers ({', '.join(names)}); run "

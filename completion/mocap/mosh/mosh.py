@@ -1,4 +1,4 @@
-"""From marker files of one subject to a moving body: all stages of [MoSh] one after the other; by sex, if wanted."""
+"""[MoSh] for one subject: shape, marker places, poses and soft tissue from markers, in stages; by sex if wanted."""
 from __future__ import annotations
 
 import time
@@ -25,23 +25,23 @@ from ..pose.follow import animate
 from ..pose.marked_body import RATE, AnimateConfig
 from ..soft_tissue.follow import SoftTissueConfig, follow_soft_tissue
 from ..soft_tissue.soft_tissue import SoftTissue
+from ..subject.misplaced_markers import MisplacedMarkers, find_misplaced_markers
 from ..subject.person import PersonConfig, PersonFit, find_person, one_or_more
-from ..subject.worn_elsewhere import Worn, find_worn
 
 T = TypeVar("T")
-STEPS = 100                          # of progress, of each stage
+STEPS = 100                          # steps of progress for each stage
 
 
 @dataclass(frozen=True)
 class PoseConfig(AnimateConfig):
-    """Settings of the poses of a person whose shape and marker places are known: as of `animate`."""
+    """Settings of the poses of a person with known shape and marker places: those of `animate`."""
 
     @classmethod
     def from_weights(cls, data: float, pose: float, velocity: float, outlier: float = 0.06) -> PoseConfig:
-        """Settings of weights on squared centimetres, on the pose prior, and on squared radians.
+        """Convert weights for squared centimetres, for the pose prior and for squared radians to settings.
 
-        A weight is the inverse of a squared deviation. That of the velocity's change from frame to frame is meant for
-        120 frames per second; at another rate the acceleration that it allows is the same.
+        A weight is an inverse variance. That of the change of velocity from frame to frame is meant for 120 frames per
+        second; at another rate it allows the same acceleration.
 
         [MoSh] Eq. 17, Eq. 21, Eq. 22
         """
@@ -58,21 +58,27 @@ class MoshConfig(Settings):
     person : PersonConfig
         Shape and marker places, from some frames.
     poses : PoseConfig
-        Poses of all frames of a person whose shape and marker places are known. Markers are held closer than by
-        `animate`, whose layout may be off. In weights of the paper they are 2, the prior 0.3 and the change of
-        velocity 57600 instead of 0.75, 1 and 6.25: the prior of a few dozen scans is narrow and must not outweigh
-        markers, and joints accelerate by 60 radians per second squared, not by 5760.
+        Poses of all frames, with known shape and marker places. Markers are trusted more than in `animate`, whose
+        layout may be inexact. In weights of the paper the markers have 2, the prior 0.3 and the change of velocity
+        57600 instead of 0.75, 1 and 6.25. The prior of a few dozen scans is narrow and must not outweigh markers, and
+        joints accelerate by 60 radians per second squared, not by 5760.
     soft : SoftTissueConfig
-        How the skin, or the shape, moves with time.
+        Movement of the skin, or of the shape, over time.
     artefacts : ArtefactConfig
-        What counts as wrong with the markers.
+        Thresholds of marker artefacts.
     soft_tissue : bool
         Let the skin move on the body.
     repair : bool
-        Put swapped labels right, seek markers that are worn elsewhere than in the layout, and leave out markers that
-        slip, jitter or stray.
+        Correct swapped labels, find misplaced markers, and leave out markers that slip, jitter or stray.
     exaggeration : float
         Factor on soft tissue in exaggerated.glb and on a character; 0 leaves it out there.
+
+    Examples
+    --------
+    >>> MoshConfig.from_paper().repair
+    False
+
+    [MoSh] Eq. 23, Eq. 24
     """
 
     person: PersonConfig = field(default_factory=PersonConfig)
@@ -85,11 +91,11 @@ class MoshConfig(Settings):
 
     @classmethod
     def from_paper(cls) -> MoshConfig:
-        """The weights of [MoSh], every marker believed alike, nothing repaired, shrunk or smoothed beyond them.
+        """Return the weights of [MoSh], with equal markers and without repair, shrinkage or further smoothing.
 
-        Not as in the paper: covariances of poses have at least (0.05 radians)² along every direction. The first frame
-        is found by a search, then all frames are solved together, by Gauss-Newton. The weight of the velocity is meant
-        for 120 frames a second, and scaled for others.
+        Three things differ from the paper. Covariances of poses have at least (0.05 radians)² in every direction. The
+        first frame is found by a search, then all frames are solved together, by Gauss-Newton. The weight of the
+        velocity is meant for 120 frames a second, and scaled for other rates.
         """
         poses = replace(PoseConfig.from_weights(0.75, 1.0, 6.25, outlier=1000.0), place_acceleration=1e6,
                         prior_shrinkage=0.0)
@@ -98,23 +104,39 @@ class MoshConfig(Settings):
 
 @dataclass(frozen=True, eq=False)
 class MoshResult:
-    """People and motions from markers alone.
+    """Shape, marker places and motions of one person, from markers alone.
 
     Attributes
     ----------
-    betas : (k,) float
+    betas : (k,) float, standard deviations
+        Shape of the person.
     layout : MarkerLayout
-        Where the markers really sat.
+        True places of the markers on this person.
     person : PersonFit
-        How they were found.
-    motions : one Motion for each sequence
-        With the shape fixed; residuals in the order of the sequence's labels, NaN where the layout does not know one.
-    soft_tissue : one SoftTissue for each sequence, or none
-    artefacts : one MarkerArtefacts for each sequence
-    worn : Worn
-        Markers that are worn elsewhere than in the layout, and pairs that bear each other's name.
+        The fit that found both.
+    motions : tuple of Motion, one for each sequence
+        With fixed shape; residuals (T, L), metres, in the order of the sequence's labels, NaN for labels that the
+        layout does not know.
+    soft_tissue : tuple of SoftTissue, one for each sequence, or empty
+    artefacts : tuple of MarkerArtefacts, one for each sequence
+    misplaced : MisplacedMarkers
+        Markers that are not where the layout has them, and pairs with exchanged names.
     seconds : {str: (2,) float}
-        How long each stage took, by the clock and of the processor: "person", "poses", "artefacts", "soft tissue".
+        Elapsed and processor time of each stage: "person", "poses", "artefacts", "soft tissue".
+
+    Examples
+    --------
+    >>> from completion import load_layout
+    >>> from model import load_built_in_model
+    >>> model = load_built_in_model()
+    >>> layout = load_layout("cmu41", model.template, np.array(model.info["people_vertices"]))
+    >>> still = MarkerSequence(np.stack([layout.place(model.template)] * 4), layout.labels, 120.0)
+    >>> quick = MoshConfig(PersonConfig(frames=2, n_betas=3, annealing=(10.0, 1.0)), soft_tissue=False, repair=False)
+    >>> result = mosh(model, still, layout, quick)
+    >>> result.betas.shape, sorted(result.seconds)
+    ((3,), ['person', 'poses'])
+
+    [MoSh] Eq. 23, Eq. 24
     """
 
     betas: np.ndarray
@@ -123,31 +145,39 @@ class MoshResult:
     motions: tuple[Motion, ...]
     soft_tissue: tuple[SoftTissue, ...]
     artefacts: tuple[MarkerArtefacts, ...]
-    worn: Worn = field(default_factory=Worn)
+    misplaced: MisplacedMarkers = field(default_factory=MisplacedMarkers)
     seconds: dict[str, np.ndarray] = field(default_factory=dict)
 
 
 @one_thread()
 def mosh(model: BodyModel, sequences: MarkerSequence | Sequence[MarkerSequence], layout: MarkerLayout,
          config: MoshConfig | None = None, progress: Progress | None = None, step: Step = run_uncached) -> MoshResult:
-    """Body shape, marker places, poses and soft tissue of one subject from marker sequences.
+    """Compute body shape, marker places, poses and soft tissue of one subject from marker sequences.
 
-    Labels are put right as far as tracks tell. The person is found from a few frames of all sequences; markers that are
-    far from where the layout has them are sought over the whole body. Then the pose of every frame is found. The motion
-    tells which labels were swapped and which markers were not on the body; where that concerns the frames that told of
-    the person, the person is found again, and so is what is wrong. At last the skin may move.
+    Labels are corrected as far as tracks tell. The person is found from a few frames of all sequences; misplaced
+    markers are searched on the whole body. Then the pose of every frame is solved. The motion tells which labels were
+    swapped and which markers are bad. Where that changes frames of the person's fit, the person is found again, and
+    poses and artefacts too. At last the skin may move.
 
     Parameters
     ----------
     model : BodyModel
+        With betas.
     sequences : MarkerSequence, or several of one subject
+        Positions (T, L, 3) in metres.
     layout : MarkerLayout
-        Where markers usually sit on the model's template. Markers that only one of the two knows are left out.
+        Where markers usually sit on the model's template. Markers that are only in one of the two are left out.
     config : MoshConfig, optional
+        Settings.
     progress : callable, optional
         Called with (done, total).
     step : callable, optional
-        Keeps what each stage finds, as `TaskContext.step` does.
+        Keeps the result of each stage, as `TaskContext.step` does.
+
+    Returns
+    -------
+    MoshResult
+        Betas (k,), the layout on this person, and a motion with poses (T, J, 3) in radians for each sequence.
 
     Raises
     ------
@@ -155,25 +185,37 @@ def mosh(model: BodyModel, sequences: MarkerSequence | Sequence[MarkerSequence],
         A model without betas, no sequence, fewer than 3 markers in common, no frame with 3 of them, a layout of
         another body.
 
+    Examples
+    --------
+    >>> from completion import load_layout
+    >>> from model import load_built_in_model
+    >>> model = load_built_in_model()
+    >>> layout = load_layout("cmu41", model.template, np.array(model.info["people_vertices"]))
+    >>> still = MarkerSequence(np.stack([layout.place(model.template)] * 4), layout.labels, 120.0)
+    >>> quick = PersonConfig(frames=2, n_betas=3, annealing=(10.0, 1.0))
+    >>> mosh(model, still, layout, MoshConfig(quick, soft_tissue=False, repair=False)).motions[0].poses.shape
+    (4, 16, 3)
+
     [MoSh] Eq. 23, Eq. 24
     """
     config = config or MoshConfig()
     trials = [_Trial(i, each, each) for i, each in enumerate(one_or_more(sequences))]
     stages = _Stages(model, config, step, progress, STEPS * (1 + len(trials) * (2 + config.soft_tissue)))
 
-    # shape and marker places from some frames, with labels as far as tracks tell; then what is worn elsewhere
+    # shape and marker places from some frames, with labels corrected by tracks; then misplaced markers
     for trial in trials:
         stages.relabel(trial)
     person = stages.find_person(trials, layout)                                 # [MoSh] Eq. 23, shape and markers
-    worn = stages.find_worn(trials, layout, person)
-    if worn.changes:
+    misplaced = stages.find_misplaced_markers(trials, layout, person)
+    if misplaced.changes:
         for trial in trials:
-            trial.order = worn.order(trial.raw, layout)
-            trial.raw, trial.markers = worn.restore_names(trial.raw, layout), worn.restore_names(trial.markers, layout)
-        layout = worn.update_layout(layout)
-        person = stages.find_person(trials, layout, "worn")
+            trial.order = misplaced.order(trial.raw, layout)
+            trial.raw = misplaced.restore_names(trial.raw, layout)
+            trial.markers = misplaced.restore_names(trial.markers, layout)
+        layout = misplaced.update_layout(layout)
+        person = stages.find_person(trials, layout, "misplaced")
 
-    # the poses of all frames, by which the markers are judged; where a frame of the person changed, it is found again
+    # poses of all frames, then artefacts; where these change a frame of the person's fit, the person is found again
     for n in range(3):
         for trial in trials:
             stages.follow(trial, person, f"poses {n} {trial.number}")           # [MoSh] Eq. 23, poses
@@ -188,32 +230,33 @@ def mosh(model: BodyModel, sequences: MarkerSequence | Sequence[MarkerSequence],
             stages.follow(trial, person, f"poses last {trial.number}")
         if config.soft_tissue:
             stages.find_soft_tissue(trial, person)                              # [MoSh] Eq. 24
+    # collect the results, artefacts in the labels of the original recordings
     every = [trial.result() for trial in trials]
     return MoshResult(person.fit.betas, person.fit.layout, person.fit, tuple(motion for motion, _, _ in every),
                       tuple(soft for _, soft, _ in every if soft is not None), tuple(found for *_, found in every),
-                      worn, stages.seconds)
+                      misplaced, stages.seconds)
 
 
 @dataclass(eq=False)
 class _Trial:
-    """A recording on its way through the stages: the markers as they came, as repaired by now, and what was found."""
+    """A recording and its results so far: raw markers, repaired markers, motion, artefacts, soft tissue."""
 
     number: int
-    raw: MarkerSequence                  # with names put back that were exchanged throughout
+    raw: MarkerSequence                  # as recorded, with exchanged names corrected
     markers: MarkerSequence
     followed: MarkerSequence | None = None       # the markers that `motion` follows
-    order: np.ndarray | None = None      # (L,) from which column of the recording `raw` takes each label
+    order: np.ndarray | None = None      # (L,) column of the recording from which `raw` takes each label
     motion: Motion | None = None
     artefacts: MarkerArtefacts | None = None
     soft: SoftTissue | None = None
 
     def is_unchanged(self, frames: int | slice = slice(None)) -> bool:
-        """Whether the markers of some frames are those that the motion follows."""
+        """Tell whether the markers of some frames are those that the motion followed."""
         assert self.followed is not None, "followed"
         return np.array_equal(self.followed.positions[frames], self.markers.positions[frames], equal_nan=True)
 
     def result(self) -> tuple[Motion, SoftTissue | None, MarkerArtefacts]:
-        """What was found, artefacts by the labels of the recording as it came."""
+        """Return the results, with artefacts in the labels of the original recording."""
         assert self.motion is not None and self.artefacts is not None, "followed and judged"
         if self.order is None:
             return self.motion, self.soft, self.artefacts
@@ -223,7 +266,7 @@ class _Trial:
 
 @dataclass(frozen=True, eq=False)
 class _Person:
-    """A person, and the body, which is made when a stage needs it."""
+    """A fitted person, and the body, which is made when a stage needs it."""
 
     model: BodyModel
     fit: PersonFit
@@ -234,13 +277,13 @@ class _Person:
 
 
 def clocks() -> np.ndarray:
-    """(2,) seconds, of which differences count: by the clock, and of the processor for this process."""
+    """Return elapsed and processor time (2,) of this process, seconds; only differences have a meaning."""
     return np.array([time.perf_counter(), time.process_time()])
 
 
 @dataclass
 class _Stages:
-    """What runs the stages of a call: each is kept by what it depends on, its seconds count, the bar moves."""
+    """Runs the stages of a call: keeps each result by its inputs, measures time, and reports progress."""
 
     model: BodyModel
     config: MoshConfig
@@ -251,7 +294,7 @@ class _Stages:
     seconds: dict[str, np.ndarray] = field(default_factory=dict)
 
     def run(self, stage: str, name: str, inputs: Any, make: Callable[[Progress | None], T], bar: bool = False) -> T:
-        """What `make` finds, or found in an earlier run; it moves the bar, if it has a share in it."""
+        """Return the result of `make`, or that of an earlier run; with `bar` it reports progress."""
         before, self.done = self.done, self.done + STEPS * bar
 
         def tell(done: int, total: int) -> None:
@@ -267,26 +310,29 @@ class _Stages:
         return value
 
     def relabel(self, trial: _Trial) -> None:
-        """Labels put right as far as tracks tell."""
+        """Correct labels as far as tracks tell."""
         if self.config.repair:
             trial.markers = self.run("artefacts", f"tracks {trial.number}", trial.raw,
                                      lambda _: relabel_by_tracks(trial.raw))
 
     def find_person(self, trials: Sequence[_Trial], layout: MarkerLayout, again: str = "") -> _Person:
-        """Shape and marker places; `again` names it where it was found before, of other markers."""
+        """Find shape and marker places; `again` names a repetition with other markers."""
         used, config, step = [trial.markers for trial in trials], self.config.person, self.step
         step = substeps(step, again) if again else step
         return _Person(self.model, self.run(
             "person", f"{again} person".strip(), (self.model, used, layout, config),
             lambda tell: find_person(self.model, used, layout, config, tell, step), not again))
 
-    def find_worn(self, trials: Sequence[_Trial], layout: MarkerLayout, person: _Person) -> Worn:
-        """Which markers are not worn as the layout says."""
-        given = self.model, [trial.markers for trial in trials], layout, person.fit, self.config.person
-        return self.run("person", "worn", given, lambda _: find_worn(*given)) if self.config.repair else Worn()
+    def find_misplaced_markers(self, trials: Sequence[_Trial], layout: MarkerLayout, person: _Person
+                               ) -> MisplacedMarkers:
+        """Find markers that do not sit where the layout says, and pairs with exchanged names."""
+        if not self.config.repair:
+            return MisplacedMarkers()
+        inputs = self.model, [trial.markers for trial in trials], layout, person.fit, self.config.person
+        return self.run("person", "misplaced", inputs, lambda _: find_misplaced_markers(*inputs))
 
     def follow(self, trial: _Trial, person: _Person, name: str) -> None:
-        """The motion of a person of fixed shape, near that of one who was thought to be a little different."""
+        """Solve the motion of a person of fixed shape, from that of an earlier fit of the person if there is one."""
         fit, poses, markers, near = person.fit, self.config.poses, trial.markers, trial.motion
         trial.motion = self.run("poses", name, (self.model, fit.betas, fit.layout, markers, poses, near),
                                 lambda tell: animate(person.subject, markers, fit.layout, poses, tell, near),
@@ -294,7 +340,7 @@ class _Stages:
         trial.followed = markers
 
     def judge(self, trial: _Trial, person: _Person, name: str) -> None:
-        """What is wrong with the markers, by the body that carries them and by what the person before has told."""
+        """Find artefacts by the body that carries the markers, from those of an earlier fit if there are any."""
         fit, markers, motion, known = person.fit, trial.raw, trial.motion, trial.artefacts
         assert motion is not None, "followed"
         if not self.config.repair:
@@ -307,7 +353,7 @@ class _Stages:
         trial.markers = trial.artefacts.repaired
 
     def find_soft_tissue(self, trial: _Trial, person: _Person) -> None:
-        """How the skin, or the shape, moves."""
+        """Estimate the movement of the skin, or of the shape."""
         model, layout, markers, motion = self.model, person.fit.layout, trial.markers, trial.motion
         soft, ground, floor = self.config.soft, self.config.poses.ground, self.config.poses.floor
         assert motion is not None, "followed"
@@ -318,18 +364,18 @@ class _Stages:
 
 @dataclass(frozen=True, eq=False)
 class SexedMosh:
-    """A person and their motions with the model of their sex.
+    """Shape and motions of a person with the model of their sex.
 
     Attributes
     ----------
     guess : SexGuess
-        What the markers told.
+        The sex that the markers suggest.
     model : BodyModel
         The model of that sex.
     neutral : PersonFit
-        The person with the neutral model, by which it was told.
+        The person with the neutral model, which gave the guess.
     result : MoshResult
-        With the model of that sex; the motions say it as their gender.
+        With the model of that sex; the motions have it as their gender.
     """
 
     guess: SexGuess
@@ -342,14 +388,14 @@ class SexedMosh:
 def mosh_by_sex(models: Mapping[str, BodyModel], sequences: MarkerSequence | Sequence[MarkerSequence],
                 layout: MarkerLayout, config: MoshConfig | None = None, progress: Progress | None = None,
                 step: Step = run_uncached) -> SexedMosh:
-    """As `mosh`, with the model of the person's sex.
+    """Run `mosh` with the model of the person's sex.
 
-    The neutral model finds a body, its betas tell the sex, and all is done with the model of that sex.
+    The neutral model finds a body, its betas suggest the sex, and `mosh` runs with the model of that sex.
 
     Parameters
     ----------
     models : {"neutral", "female", "male": BodyModel}
-        As `learn_by_sex` makes them, of one topology; the neutral one keeps what tells women from men.
+        As `learn_by_sex` makes them, of one topology; the neutral one stores how women and men differ.
     sequences, layout, config, progress, step
         As for `mosh`.
 
@@ -371,7 +417,7 @@ def mosh_by_sex(models: Mapping[str, BodyModel], sequences: MarkerSequence | Seq
 
 
 def check_models(models: Mapping[str, BodyModel]) -> None:
-    """ValueError for models with which a sex cannot be told or used."""
+    """Check the three models; ValueError where one is missing or does not fit."""
     missing = [name for name in ("neutral", "female", "male") if name not in models]
     if missing:
         raise ValueError(f"models: expected 'neutral', 'female' and 'male', {' and '.join(missing)} missing")

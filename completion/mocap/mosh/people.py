@@ -1,4 +1,4 @@
-"""What the output of `scape mosh` tells of its people, to be looked at: read from the files, when it is wanted."""
+"""The people in an output of `scape mosh`, for review: read from the files when needed."""
 from __future__ import annotations
 
 from collections.abc import Sequence
@@ -29,7 +29,7 @@ from .recordings import Actor, Recording
 
 @dataclass(frozen=True)
 class WorstFrame:
-    """A frame of a recording, and the mean distance of its markers, metres."""
+    """A frame of a recording, its text for the page, and the mean distance of its markers, metres."""
 
     take: int
     number: int
@@ -39,15 +39,15 @@ class WorstFrame:
 
 @dataclass(frozen=True, eq=False)
 class FoundPerson:
-    """A person as `scape mosh` found it, in a folder.
+    """A person as found by `scape mosh`, in a folder.
 
     Attributes
     ----------
-    recordings : those that could be read
+    recordings : tuple of Recording, those that could be read
     layout : MarkerLayout
-        Where the markers were found, in the names of the recordings.
+        Places of the markers that were found, in the names of the recordings.
     about : dict
-        What subject.json tells.
+        Content of subject.json.
     """
 
     name: str
@@ -69,70 +69,70 @@ class FoundPerson:
 
     @cached_property
     def body(self) -> Mesh:
-        """At rest."""
+        """The body at rest."""
         return person_in_mean_pose(self.model, np.array(self.about["betas"]))
 
     @cached_property
     def skin(self) -> Surface:
-        """At rest, for what is nearest."""
+        """The surface at rest, for nearest points."""
         return Surface(self.body)
 
     @cached_property
     def places(self) -> dict[str, np.ndarray]:
-        """Label -> (3,) where it was found on the body at rest."""
+        """Label -> place (3,), metres, on the body at rest."""
         return dict(zip(self.layout.labels, self.layout.skin_points(self.body.vertices), strict=True))
 
     @cached_property
     def motions(self) -> list[Motion]:
-        """One for each recording."""
+        """The motion of each recording."""
         return [Motion.load(self.folder / one.name / "motion.npz") for one in self.recordings]
 
     @cached_property
     def markers(self) -> list[MarkerSequence]:
-        """As they were measured."""
-        found = list[MarkerSequence]()
+        """The measured markers of each recording."""
+        sequences = list[MarkerSequence]()
         for one in self.recordings:
             labelled = self.folder / one.name / LABELLED
-            found.append(read_labelled(labelled, one.path, self.unit, self.rate) if labelled.exists()
+            sequences.append(read_labelled(labelled, one.path, self.unit, self.rate) if labelled.exists()
                          else read_markers(one.path, self.unit, one.who, self.rate))
-        return found
+        return sequences
 
     @cached_property
     def labels(self) -> list[str]:
-        """All of the recordings."""
+        """All labels of the recordings."""
         return list(dict.fromkeys(label for motion in self.motions for label in motion.labels))
 
     @cached_property
     def off(self) -> dict[str, float]:
-        """Label -> mean distance from where the body has it, metres; NaN for one that was not used."""
+        """Label -> mean distance from the simulated marker, metres; NaN for one that was not used."""
         columns: dict[str, list[np.ndarray]] = {}
         for motion in self.motions:
             for label, column in zip(motion.labels, motion.residuals.T, strict=True):
                 columns.setdefault(label, []).append(column)
-        return {label: float(mean_over(np.concatenate(some), 0)) for label, some in columns.items()}
+        return {label: float(mean_over(np.concatenate(residuals), 0)) for label, residuals in columns.items()}
 
     @cached_property
     def names(self) -> list[str]:
-        """The markers that have a place or were left out of use, the worst first."""
+        """Labels of markers that have a place or were left out, the worst first."""
         out = [label for label in self.about["left_out"] if label in self.off]
         return [*out, *sorted(set(self.places) - set(out), key=lambda label: -np.nan_to_num(self.off.get(label, 0.0)))]
 
     @cached_property
     def doubts(self) -> dict[str, list[str]]:
-        """Label -> what was found wrong with it."""
-        found: dict[str, list[str]] = {}
-        for label, moved in self.about["worn_elsewhere"].items():
+        """Label -> sentences about what was wrong with it."""
+        doubts: dict[str, list[str]] = {}
+        for label, moved in self.about["misplaced"].items():
             before, left = (1000 * moved[name] for name in ("from_the_layout", "left"))
-            found.setdefault(label, []).append(f"worn {before:.0f} mm from where the layout has it; moved there, "
+            doubts.setdefault(label, []).append(f"worn {before:.0f} mm from where the layout has it; moved there, "
                                                f"{left:.0f} mm are left")
         for pair in self.about["exchanged"]:
             for label, other in (pair, pair[::-1]):
-                found.setdefault(label, []).append(f"bears the name of {other} throughout; put back")
+                doubts.setdefault(label, []).append(f"bears the name of {other} throughout; put back")
         for label in self.about["left_out"]:
-            found.setdefault(label, []).append("not worn where the layout has it, and found nowhere: left out")
+            doubts.setdefault(label, []).append("not worn where the layout has it, and found nowhere: left out")
         for one, motion in zip(self.recordings, self.motions, strict=True):
             for label in motion.distrusted:
-                found.setdefault(label, []).append(f"{one.name}: hardly believed")
+                doubts.setdefault(label, []).append(f"{one.name}: hardly believed")
             path = self.folder / one.name / "artefacts.json"
             told = storage.read_json(path, "a list of artefacts")
             with storage.taking_apart(path, "a list of artefacts"):
@@ -142,28 +142,29 @@ class FoundPerson:
                 lines += [(b["label"], f"{b['kind']} by {1000 * b['distance']:.0f} mm from {b['begin'] / rate:.2f} to "
                            f"{b['end'] / rate:.2f} s") for b in told["bad"]]
             for label, line in lines:
-                found.setdefault(label, []).append(f"{one.name}: {line}")
-        return found
+                doubts.setdefault(label, []).append(f"{one.name}: {line}")
+        return doubts
 
     @cached_property
     def worst(self) -> list[WorstFrame]:
-        """The frames of all recordings in which the markers are farthest, the worst first."""
-        found = []
-        frames = 6  # worst frames that are shown of a person
+        """The frames of all recordings with the largest distances, the worst first."""
+        every = []
+        frames = 6  # frames shown for a person
         for take, (one, motion) in enumerate(zip(self.recordings, self.motions, strict=True)):
             for t in worst_frames(motion, frames).tolist():
                 off = float(mean_over(motion.residuals[t], 0))
                 if np.isfinite(off):
                     told = f"{one.name}, {t / motion.rate:.2f} s: {1000 * off:.0f} mm"
-                    found.append(WorstFrame(take, t, told, off))
-        return sorted(found, key=lambda frame: -frame.off)[:frames] or [WorstFrame(0, 0, self.recordings[0].name, 0.0)]
+                    every.append(WorstFrame(take, t, told, off))
+        return sorted(every, key=lambda frame: -frame.off)[:frames] or [WorstFrame(0, 0, self.recordings[0].name, 0.0)]
 
     def pane(self, frame: WorstFrame) -> Pane:
-        """The body in a frame with the measured markers, coloured by how far they are from where it has them."""
+        """Return the body in a frame with the measured markers, coloured by their distance from the simulated ones."""
         motion = self.motions[frame.take]
         vertices = motion.vertices(self.subject, np.array([frame.number]))[0].astype(float)
         body, markers = self.model.template.with_vertices(vertices), self.markers[frame.take]
         measured = dict(zip(markers.labels, markers.positions[frame.number], strict=True))
+        # names as they were corrected, then the markers that have a place
         for first, second in self.about["exchanged"]:
             if first in measured and second in measured:
                 measured[first], measured[second] = measured[second], measured[first]
@@ -180,18 +181,20 @@ class FoundPerson:
 
 def load_people(folder: Path, actors: Sequence[Actor], models: Models, unit: str | None,
                 rate: float | None) -> list[FoundPerson]:
-    """The people of an output, as their files tell; StorageError where they do not, ValueError where there are none."""
-    found = []
+    """Read the people of an output; StorageError for damaged files, ValueError where there are none."""
+    people = []
     for actor in actors:
         own = folder / actor.name
         about = storage.read_json(own / "subject.json", "a person that scape mosh found")
         with storage.taking_apart(own / "subject.json", "a person that scape mosh found"):
             model = models.sexes.get((about["sex"] or {}).get("sex", ""), models.neutral)
-            about = {name: about[name] for name in ("betas", "layout", "worn_elsewhere", "exchanged", "left_out")}
+            if "worn_elsewhere" in about:      # the key of "misplaced" in files of earlier versions
+                about["misplaced"] = about["worn_elsewhere"]
+            about = {name: about[name] for name in ("betas", "layout", "misplaced", "exchanged", "left_out")}
         layout = MarkerLayout.load(own / "layout.json", len(model.template.vertices))
-        there = tuple(one for one in actor.recordings if (own / one.name / "motion.npz").exists())
-        if there:
-            found.append(FoundPerson(actor.name, own, there, model, layout, about, unit, rate))
-    if not found:
+        readable = tuple(one for one in actor.recordings if (own / one.name / "motion.npz").exists())
+        if readable:
+            people.append(FoundPerson(actor.name, own, readable, model, layout, about, unit, rate))
+    if not people:
         raise ValueError(f"{folder}: expected what scape mosh found of the people, there is none; run it once more")
-    return found
+    return people

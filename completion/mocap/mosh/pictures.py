@@ -1,4 +1,4 @@
-"""Pictures of a person with markers and of what soft tissue does; charts of how far the markers are from the body."""
+"""Pictures of a person with markers and of its soft tissue; charts of the distance of markers from the body."""
 from __future__ import annotations
 
 from collections.abc import Sequence
@@ -31,30 +31,30 @@ from ..marker_sets.layout import MarkerLayout
 from .takes import Take
 
 USUAL, UNCERTAIN, UNUSED = (0.30, 0.50, 0.72), (0.93, 0.62, 0.16), (0.20, 0.62, 0.32)
-LITTLE = 0.005                       # metres: the end of a colour scale that must not make much of nothing
+LITTLE = 0.005                       # metres: least end of a colour scale, so that tiny changes stay pale
 
 
 def person_in_mean_pose(model: BodyModel, betas: np.ndarray) -> Mesh:
-    """The person in the mean pose of the training set."""
+    """Return the person in the mean pose of the training set."""
     return model.template.with_vertices(model.vertices(model.pose_mean, betas))
 
 
 def picture_sides(body: Mesh, found: np.ndarray, height: int = 360) -> np.ndarray:
-    """A body from four sides with its markers (L, 3)."""
+    """Render a body with its markers (L, 3) from four sides."""
     shapes: list[Shape] = [Solid(body), Dots(found, MARKER, 0.011)]
     sides = zip(look_around(body), ("front", "left", "back", "right"), strict=True)
     return picture_panes([Pane(shapes, camera, side) for camera, side in sides], height)
 
 
 def person_pane(body: Mesh, found: np.ndarray, usual: np.ndarray, labels: Sequence[str]) -> Pane:
-    """A body with its markers (L, 3), and where they usually sit (L, 3) with a rod from there."""
+    """Return a body with its markers (L, 3), and their usual places (L, 3) with a rod between the two."""
     return Pane([Solid(body, name="body"), Dots(found, MARKER, 0.011, name="markers as found", labels=labels),
                  Dots(usual, USUAL, 0.009, name="in the layout"),
                  Bones(usual, found, USUAL, 0.004, name="from one to the other")], look_around(body, turns=(20,))[0])
 
 
 def kinds_of_markers(take: Take) -> dict[str, tuple[Sequence[float], np.ndarray]]:
-    """Name -> colour and places (T, L, 3) of the measured markers that are so; NaN elsewhere."""
+    """Return kind -> colour and positions (T, L, 3) of the measured markers of that kind, NaN elsewhere."""
     held = np.isin(take.markers.labels, () if take.held is None else take.held.labels)
     used = np.isfinite(take.motion.residuals).any(axis=0) & ~held
     kinds = {"believed markers": (MARKER, take.motion.trusted & used),
@@ -65,12 +65,12 @@ def kinds_of_markers(take: Take) -> dict[str, tuple[Sequence[float], np.ndarray]
 
 
 def take_marker_dots(take: Take, t: int, radius: float = 0.014) -> list[Dots]:
-    """The measured markers of a frame: believed, not believed, and those that no stage has seen."""
+    """Return the measured markers of a frame as dots: trusted, distrusted and held-out ones."""
     return [Dots(at[t], color, radius, name=name) for name, (color, at) in kinds_of_markers(take).items()]
 
 
 def take_pane(take: Take) -> Pane:
-    """The whole sequence with its markers."""
+    """Return the whole sequence with its markers."""
     frames, _ = frames_to_play(take.shown)
     dots = [(Dots(at[0], color, 0.013, name=name, labels=take.markers.labels), at[frames])
             for name, (color, at) in kinds_of_markers(take).items()]
@@ -79,7 +79,7 @@ def take_pane(take: Take) -> Pane:
 
 def take_frame_panes(take: Take, frames: np.ndarray, looks: Sequence[Sequence[Shape]] | None = None,
                      radius: float = 0.014) -> list[Pane]:
-    """Some frames with their markers; `looks` shows the body of each, if not as it is."""
+    """Return some frames with their markers; `looks` replaces the plain body in each."""
     vertical, bodies = upwards(take.shown, take.subject), take.bodies(frames)
     looks = looks or [[take.light.mesh(body)] for body in bodies]
     return [Pane([*look, *take_marker_dots(take, int(t), radius)],
@@ -89,14 +89,14 @@ def take_frame_panes(take: Take, frames: np.ndarray, looks: Sequence[Sequence[Sh
 
 
 def picture_large(take: Take, frames: np.ndarray, height: int = 340) -> np.ndarray:
-    """Some frames in a row, each as large as fits."""
+    """Render some frames in a row."""
     panes = take_frame_panes(take, frames)
     return contact_sheet([picture_pane(pane, round(0.62 * height), height) for pane in panes],
                          [pane.label for pane in panes])
 
 
 def soft_change(take: Take, frames: np.ndarray) -> np.ndarray:
-    """How far soft tissue moves the skin outwards (n, N), metres; inwards is negative."""
+    """Compute the displacement (n, N), metres, of the skin by soft tissue along the normal; inwards is negative."""
     rigid, soft = take.rigid(frames), take.bodies(frames)
     template = take.subject.template
     normals = np.stack([template.with_vertices(v).vertex_normals for v in rigid])
@@ -104,7 +104,7 @@ def soft_change(take: Take, frames: np.ndarray) -> np.ndarray:
 
 
 def soft_pane(take: Take, frames: np.ndarray) -> Pane:
-    """Where the body is soft: the root mean square of the change over some frames."""
+    """Return a body coloured by the root mean square displacement of soft tissue over some frames."""
     change = np.sqrt(((take.bodies(frames) - take.rigid(frames))**2).sum(axis=2).mean(axis=0))
     body = take.subject.template.with_vertices(
         take.subject.vertices(take.model.pose_mean).astype(float))
@@ -114,7 +114,7 @@ def soft_pane(take: Take, frames: np.ndarray) -> Pane:
 
 
 def soft_tissue_panes(take: Take, frames: np.ndarray) -> list[Pane]:
-    """Frames with soft tissue, coloured by how far it moves the skin; the fixed shape can be laid over each."""
+    """Return frames coloured by the displacement of the skin, with the fixed shape as a hidden layer."""
     change, light, looks = soft_change(take, frames), take.light, list[list[Shape]]()
     end = max(float(np.percentile(np.abs(change), 99.5)), LITTLE)
     for rigid, soft, out in zip(take.rigid(frames), take.bodies(frames), change, strict=True):
@@ -125,13 +125,13 @@ def soft_tissue_panes(take: Take, frames: np.ndarray) -> list[Pane]:
 
 
 def most_changed(take: Take, frames: np.ndarray, count: int) -> np.ndarray:
-    """Of some frames those, in order, in which soft tissue moves the body most, no two close in time."""
+    """Return the frames, in order, in which soft tissue moves the body most, no two close in time."""
     size = np.sqrt((soft_change(take, frames)**2).mean(axis=1))
     return frames_apart(frames[np.argsort(-size)], count, len(take.motion.poses) / (3 * count))
 
 
 def change_of_place(body: Mesh, layout: MarkerLayout, found: MarkerLayout) -> tuple[np.ndarray, np.ndarray]:
-    """Where markers sit on a body (L, 3) metres, and from where they usually sit: up, forward, to its left (L, 3)."""
+    """Compute places (L, 3), metres, of markers on a body, and the way from usual places: up, forward, left (L, 3)."""
     vertical, ahead = stance(body)
     axes = np.stack([vertical, ahead, np.cross(vertical, ahead)])
     places = found.place(body)
@@ -143,12 +143,12 @@ STATES = {"believed": "#e3eaf0", "not believed": "#f0c46c", "missing": "#9aa3ab"
 
 
 def _average_stretches(values: np.ndarray, most: int = 900) -> np.ndarray:
-    """Means (n, ...) of stretches of the rows (T, ...), at most so many."""
+    """Average rows (T, ...) over at most `most` stretches of equal length."""
     return np.stack([mean_over(part, 0) for part in np.array_split(values, min(most, len(values)))])
 
 
 def chart_frames(take: Take) -> Any:
-    """The mean distance of the markers in every frame, with fixed shape, soft tissue, and of held-out ones."""
+    """Plot the mean distance of the markers over time: fixed shape, soft tissue, held-out markers."""
     figure, axes = chart(7.8, 2.7)
     lines = [("fixed shape", take.motion.residuals, "#7a8794")]
     if take.soft is not None:
@@ -166,7 +166,7 @@ def chart_frames(take: Take) -> Any:
 
 
 def chart_map(take: Take) -> Any:
-    """The distance of every marker in every frame, the worst marker first; white where it was not seen."""
+    """Plot the distance of every marker over time, the worst marker first; white where it was not seen."""
     off = take.shown.residuals
     used = np.flatnonzero(np.isfinite(off).any(axis=0))
     used = used[np.argsort(-mean_over(off[:, used], 0))]
@@ -182,10 +182,11 @@ def chart_map(take: Take) -> Any:
 
 
 def chart_timeline(take: Take) -> Any:
-    """When which marker was missing, not believed, swapped with another, or elsewhere than the body says."""
+    """Plot the state of every marker over time: seen, distrusted, missing, swapped, or a bad span."""
     markers, found, names = take.markers, take.artefacts, list(STATES)
     labels = [label for label in markers.labels if label in found.labels_touched or label in found.labels]
     columns = [markers.labels.index(label) for label in labels]
+    # 0 trusted, 1 distrusted, 2 missing, then the kinds of artefacts
     uncertain = np.isfinite(take.motion.residuals[:, columns]) & ~take.motion.trusted[:, columns]
     state = np.where(markers.seen[:, columns], uncertain.astype(int), names.index("missing"))
     for label, spans in _spans(found).items():
@@ -195,7 +196,7 @@ def chart_timeline(take: Take) -> Any:
 
 
 def _spans(found: MarkerArtefacts) -> dict[str, list[tuple[str, int, int, str]]]:
-    """For every label with an artefact: kind, first and last frame, and the other label of a swap."""
+    """Return label -> spans of artefacts: kind, first and last frame, and the other label of a swap."""
     out: dict[str, list[tuple[str, int, int, str]]] = {}
     for s in found.swaps:
         for label, other in ((s.first, s.second), (s.second, s.first)):
@@ -206,14 +207,15 @@ def _spans(found: MarkerArtefacts) -> dict[str, list[tuple[str, int, int, str]]]
 
 
 def chart_artefacts(found: MarkerArtefacts, markers: MarkerSequence, rows: int = 16) -> Any:
-    """Distances from the simulated markers over time, logarithmic, of those with the most frames of artefacts.
+    """Plot distances from the simulated markers over time, for the markers with the most frames of artefacts.
 
-    One row a marker: the distance as it came in `markers` in grey, what is left of it in black.
+    There is one row for each marker, on a logarithmic scale: raw distance in grey, repaired distance in black.
     """
     from matplotlib.figure import Figure
     from matplotlib.patches import Patch
 
     spans, times, most, step = _spans(found), markers.times, 400.0, 1 / markers.rate
+    # the markers with the longest artefacts in all
     length = {label: sum(end - begin + 1 for _, begin, end, _ in some) for label, some in spans.items()}
     shown = sorted((label for label in spans if label in found.labels), key=lambda label: -length[label])[:rows]
     figure = Figure(figsize=(7.8, 0.8 + 0.55 * max(1, len(shown))))
@@ -223,6 +225,7 @@ def chart_artefacts(found: MarkerArtefacts, markers: MarkerSequence, rows: int =
     axes = figure.subplots(len(shown), 1, sharex=True, squeeze=False)[:, 0]
     for axis, label in zip(axes, shown, strict=True):
         row = found.labels.index(label)
+        # spans as coloured bands, with the other label of a longer swap
         for kind, begin, end, other in spans[label]:
             axis.axvspan(times[begin] - step / 2, times[end] + step / 2, color=STATES[kind], alpha=0.45, linewidth=0)
             if other and (end - begin) > 0.06 * len(times):
@@ -237,6 +240,7 @@ def chart_artefacts(found: MarkerArtefacts, markers: MarkerSequence, rows: int =
         axis.set_ylabel(label, rotation=0, ha="right", va="center", fontsize=8)
         axis.spines[["top", "right"]].set_visible(False)
     axes[-1].set_xlabel("time (s)")
+    # a legend of the kinds that occur, and how many markers are not shown
     used = [kind for kind in STATES if any(kind == some[0] for label in shown for some in spans[label])]
     hidden = len(spans) - len(shown)
     figure.legend(handles=[Patch(color=STATES[kind], alpha=0.45, label=kind) for kind in used], frameon=False,

@@ -1,4 +1,4 @@
-"""Which marker files belong to whom."""
+"""Group marker files by person."""
 from __future__ import annotations
 
 import re
@@ -20,7 +20,7 @@ TABLE = "subjects.csv"
 
 @dataclass(frozen=True)
 class Recording:
-    """One sequence of one person: its file, the name of its output folder, and whose markers in it, if of several."""
+    """One sequence of one person: its file, its output folder, and the prefix of labels if it has several people."""
 
     path: Path
     name: str
@@ -29,7 +29,7 @@ class Recording:
 
 @dataclass(frozen=True)
 class Actor:
-    """A person, by a name fit for a folder, the recordings of it, and the rule by which these are thought to be so."""
+    """A person: a name fit for a folder, its recordings, and the rule that grouped them."""
 
     name: str
     recordings: tuple[Recording, ...]
@@ -38,20 +38,20 @@ class Actor:
 
 @dataclass(frozen=True)
 class Grouping:
-    """How recordings are given to people: by a rule, see --subjects of `scape mosh`, or by a table.
+    """How recordings are assigned to people: by a rule, see --subjects of `scape mosh`, or by a table.
 
-    "auto" is, of files that were named, "all"; of a folder its sub-folders, and of files that lie side by side "name"
-    where the name is two numbers, as in 85_02, else "label", else "each". Several people in one file are kept apart,
-    by their labels, whatever the rule.
+    "auto" means "all" for files that were named. In a folder it goes by sub-folder. For files side by side it is "name"
+    where the name is two numbers, such as 85_02, else "label", else "each". Several people in one file are always kept
+    apart by their labels.
     """
 
     by: By = "auto"
     table: Path | None = None            # CSV with the columns file and subject, or JSON {file: subject}
-    who: str | None = None               # whose markers, in files with several people
+    who: str | None = None               # prefix of the labels to read, in files with several people
 
     @staticmethod
     def of(subjects: str) -> Grouping:
-        """By a rule that is named, by a table, or whose markers they are."""
+        """Parse the value of --subjects: a rule, a table, or a prefix of labels."""
         if subjects in get_args(By):
             return Grouping(cast(By, subjects))
         if Path(subjects).suffix.lower() in (".csv", ".json"):
@@ -63,72 +63,74 @@ class Grouping:
 
 
 def find_actors(markers: Iterable[Path], grouping: Grouping, output: Path | None = None) -> list[Actor]:
-    """The people of some files and folders; what lies in `output` is no recording. ValueError for what cannot be."""
-    given = list(markers)
-    for place in given:
+    """Find the people of some files and folders, outside `output`; ValueError where there is none."""
+    sources = list(markers)
+    for place in sources:
         if output is not None and place.is_dir() and output.resolve() in (place.resolve(), *place.resolve().parents):
             raise ValueError(f"{output}: expected a folder for the output that does not hold the recordings, {place}")
-    found = list(_files(given, output, grouping))
-    if grouping.who is not None and found:
-        there = set().union(*(label_prefixes(file.path) for file in found))
-        if not there & set(grouping.who.split(",")):
+    files = list(_files(sources, output, grouping))
+    # a named prefix has to occur
+    if grouping.who is not None and files:
+        prefixes = set().union(*(label_prefixes(file.path) for file in files))
+        if not prefixes & set(grouping.who.split(",")):
             raise UsageError(f"--subjects: expected a file .csv or .json, one of {', '.join(get_args(By))}, or what "
-                             f"stands before the colon of labels ({', '.join(sorted(there)) or 'here: none'}), "
+                             f"stands before the colon of labels ({', '.join(sorted(prefixes)) or 'here: none'}), "
                              f"got '{grouping.who}'")
-    if not found:
-        raise ValueError(f"{', '.join(map(str, given))}: expected files ending in {', '.join(READERS)}, found none")
-    whole = grouping.by == "all" or (grouping.by == "auto" and all(path.is_file() for path in given)
-                                     and not any(len(f.people) > 1 for f in found))
+    if not files:
+        raise ValueError(f"{', '.join(map(str, sources))}: expected files ending in {', '.join(READERS)}, found none")
+    # rows of person, file, prefix and rule: by the table, all together, or file by file
+    whole = grouping.by == "all" or (grouping.by == "auto" and all(path.is_file() for path in sources)
+                                     and not any(len(f.people) > 1 for f in files))
     if grouping.table is not None:
-        said = _read_table(grouping.table, [f.path for f in found])
+        subject_of = _read_table(grouping.table, [f.path for f in files])
         rows = []
-        for f, subject in [(file, subject) for file in found for subject in said.get(file.path, ())]:
-            # of several people in a file the one whom the table names
+        for f, subject in [(file, subject) for file in files for subject in subject_of.get(file.path, ())]:
+            # in a file with several people, the one whom the table names
             named = (who for who in f.people if folder_name(who) == folder_name(subject))
             who = grouping.who or (next(named, None) if len(f.people) > 1 else None)
             rows.append((folder_name(subject), f, who, f"as {grouping.table} says"))
     elif whole:
-        name = next(_people(found[0], grouping))[0]
-        if len(given) == 1 and given[0].is_dir():
-            name = given[0].resolve().name
-        rows = [(folder_name(name), f, grouping.who, "files that were named together") for f in found]
+        name = next(_people(files[0], grouping))[0]
+        if len(sources) == 1 and sources[0].is_dir():
+            name = sources[0].resolve().name
+        rows = [(folder_name(name), f, grouping.who, "files that were named together") for f in files]
     else:
-        rows = [(folder_name(name), f, who, rule) for f in found for name, who, rule in _people(f, grouping)]
+        rows = [(folder_name(name), f, who, rule) for f in files for name, who, rule in _people(f, grouping)]
     return [Actor(person, _name_recordings(person, [(f, who) for name, f, who, _ in rows if name == person]),
                   next(rule for name, *_, rule in rows if name == person))
             for person in sorted({name for name, *_ in rows})]
 
 
 def write_grouping(path: Path, actors: Iterable[Actor]) -> None:
-    """Who is who as CSV, in the form that `Grouping.table` takes."""
+    """Write the people and their files as CSV, in the form that `Grouping.table` takes."""
     tables.write_table(path, ("file", "subject", "rule"),
                        ((r.path, actor.name, actor.rule) for actor in actors for r in actor.recordings))
 
 
 def folder_name(text: str) -> str:
-    """A text as the name of a folder: letters, digits and - _ . only."""
+    """Turn a text into the name of a folder: letters, digits and - _ . only."""
     return re.sub(r"[^\w.-]+", "_", text).strip("._") or "person"
 
 
 @dataclass(frozen=True)
 class _File:
-    """A marker file, the folders it lies in below the one that was given, and the people that its labels tell."""
+    """A marker file, its folders below the one that was named, and the people in its labels."""
 
     path: Path
     folders: tuple[str, ...]
-    people: tuple[str, ...]              # none where one of them is named
+    people: tuple[str, ...]              # empty where a prefix was named
 
 
-def _files(given: list[Path], output: Path | None, grouping: Grouping) -> Iterator[_File]:
-    """The files that were named, and the marker files of the folders that were, each once."""
+def _files(sources: list[Path], output: Path | None, grouping: Grouping) -> Iterator[_File]:
+    """Yield the files that were named and the marker files of named folders, each once."""
     seen = set() if grouping.table is None else {grouping.table.resolve()}
     outputs = {output.resolve()} if output is not None else set()
-    for place in given:
+    for place in sources:
         if not place.exists():
             raise ValueError(f"{place}: no such file or folder")
-        if place.is_dir():                             # nor what an earlier call has written
-            outputs |= {found.parent.resolve() for found in place.rglob(TABLE)
-                        if (found.parent / "report.html").exists() or (found.parent / HOME).exists()}
+        if place.is_dir():                             # outputs of earlier calls are no recordings
+            outputs |= {table.parent.resolve() for table in place.rglob(TABLE)
+                        if (table.parent / "report.html").exists() or (table.parent / HOME).exists()}
         for path in sorted(place.rglob("*")) if place.is_dir() else [place]:
             parts, whole = path.relative_to(place).parts, path.resolve()
             if place.is_dir() and (path.suffix.lower() not in READERS or any(part.startswith(".") for part in parts)
@@ -138,30 +140,30 @@ def _files(given: list[Path], output: Path | None, grouping: Grouping) -> Iterat
                 seen.add(whole)
                 try:
                     people = marker_subjects(path) if grouping.who is None else ()
-                except MarkerFileError:  # told when the file is read in earnest
+                except MarkerFileError:  # reported when the file is read as a whole
                     people = ()
                 yield _File(path, parts[:-1], people)
 
 
 def _people(file: _File, grouping: Grouping) -> Iterator[tuple[str, str | None, str]]:
-    """Name, C3D subject and rule of the people in a file."""
-    by, own = grouping.by, file.path.stem
-    numbers, people = re.fullmatch(r"(\d+)[_-]\d+", own), file.people
+    """Yield name, prefix of labels and rule for the people in a file."""
+    by, stem = grouping.by, file.path.stem
+    numbers, people = re.fullmatch(r"(\d+)[_-]\d+", stem), file.people
     if len(people) > 1:
         for who in people:
             yield who, who, "by what stands before the labels"
     elif by == "auto" and file.folders:
         yield file.folders[0], grouping.who, "by the sub-folder"
     elif by == "name" or (by == "auto" and numbers):
-        yield re.split(r"[_\-\s]", own)[0], grouping.who, "by the file name" + (", NUMBER_NUMBER" if numbers else "")
+        yield re.split(r"[_\-\s]", stem)[0], grouping.who, "by the file name" + (", NUMBER_NUMBER" if numbers else "")
     elif by != "each" and people:
         yield people[0], None, "by what stands before the labels"
     else:
-        yield own if grouping.who is None or by == "each" else grouping.who, grouping.who, "a file by itself"
+        yield stem if grouping.who is None or by == "each" else grouping.who, grouping.who, "a file by itself"
 
 
 def _name_recordings(person: str, files: list[tuple[_File, str | None]]) -> tuple[Recording, ...]:
-    """The recordings of a person, each named as its file, with its ending where that is not enough."""
+    """Name the recordings of a person by their files, with the ending where names would be equal."""
     def name(file: _File, ending: bool) -> str:
         folders = file.folders[1:] if file.folders and folder_name(file.folders[0]) == person else file.folders
         return folder_name("_".join((*folders, file.path.name if ending else file.path.stem)))
@@ -176,7 +178,7 @@ def _name_recordings(person: str, files: list[tuple[_File, str | None]]) -> tupl
 
 
 def _read_table(table: Path, found: list[Path]) -> dict[Path, list[str]]:
-    """Whose each file is, of those that the table names by path, by name or without ending; several of some."""
+    """Read which people each file has; the table names files by path, by name or without ending."""
     out: dict[Path, list[str]] = {}
     for file, subject in _table_rows(table):
         wanted = Path(file)
@@ -191,6 +193,7 @@ def _read_table(table: Path, found: list[Path]) -> dict[Path, list[str]]:
 
 
 def _table_rows(table: Path) -> list[tuple[str, str]]:
+    """Read pairs of file and subject from JSON or CSV."""
     if table.suffix.lower() == ".json":
         tree = storage.read_json(table, "the subjects {file: subject}")
         if not isinstance(tree, dict) or not all(isinstance(v, str | int) for v in tree.values()):

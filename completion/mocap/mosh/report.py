@@ -1,4 +1,4 @@
-"""The pages of `scape mosh`: one for a person, one for each sequence."""
+"""Report pages of `scape mosh`: one for a person, one for each sequence."""
 from __future__ import annotations
 
 import io
@@ -31,10 +31,11 @@ from .takes import Take
 def person_page(name: str, model: BodyModel, result: MoshResult, usual: MarkerLayout, takes: Sequence[Take],
                 metrics: Sequence[Metric], figures: Mapping[str, Sequence[Metric]], settings: Mapping[str, Any]
                 ) -> Page:
-    """Shape and markers of a person, before in the `usual` layout, and the way to its sequences and their figures."""
-    body, labels, worn = pictures.person_in_mean_pose(model, result.betas), result.layout.labels, result.worn
+    """Make the page of a person: shape, markers before and after, links to its sequences and their figures."""
+    body, labels, misplaced = pictures.person_in_mean_pose(model, result.betas), result.layout.labels, result.misplaced
     before = usual.select(labels)
     found, moved = pictures.change_of_place(body, before, result.layout)
+    # the body with its markers, and the sequences
     page = Page(f"{name}: body shape and markers",
                 f"Found from the markers of {len(takes)} {'sequence' if len(takes) == 1 else 'sequences'} alone.")
     ways = [f"{label}: {MM * far:.0f} mm" for label, far in zip(labels, np.linalg.norm(moved, axis=1), strict=True)]
@@ -44,16 +45,18 @@ def person_page(name: str, model: BodyModel, result: MoshResult, usual: MarkerLa
     page.section("Sequences")
     for take in takes:
         add_entry(page, take.name, map(as_line, _main(figures[take.name])))
-    if worn.changes or worn.too_many:
+    # misplaced markers and exchanged names
+    if misplaced.changes or misplaced.too_many:
         page.section("Markers worn elsewhere", "Markers that were far from where the layout has them, sought over the "
                      "whole body that the others tell.")
         page.table([*((f"{first} and {second}", "bore each other's name; put back", np.nan, np.nan)
-                      for first, second in worn.exchanged),
-                    *((m.label, "worn elsewhere; moved there", MM * m.before, MM * m.after) for m in worn.moved),
-                    *((label, "no place on the skin explains it; left out", np.nan, np.nan) for label in worn.unplaced),
-                    *((label, "too many are far off; let be", np.nan, np.nan) for label in worn.too_many)],
+                      for first, second in misplaced.exchanged),
+                    *((m.label, "worn elsewhere; moved there", MM * m.before, MM * m.after) for m in misplaced.moved),
+                    *((label, "no place on the skin explains it; left out", np.nan, np.nan)
+                      for label in misplaced.unplaced),
+                    *((label, "too many are far off; let be", np.nan, np.nan) for label in misplaced.too_many)],
                    ("marker", "what was found", "from the layout's place (mm)", "from the new place (mm)"))
-    # the markers, that which moved most first
+    # a table of markers, the one that moved most first
     left: dict[str, list[np.ndarray]] = {}
     for take in takes:
         for label, column in zip(take.motion.labels, take.motion.residuals.T, strict=True):
@@ -75,9 +78,9 @@ def person_page(name: str, model: BodyModel, result: MoshResult, usual: MarkerLa
 
 
 def take_page(take: Take, metrics: Sequence[Metric], picture: np.ndarray) -> Page:
-    """One sequence: the whole of it at a glance, how far the markers are, soft tissue, artefacts; see `closing`."""
+    """Make the page of a sequence: motion, distances of markers, soft tissue, artefacts; `closing` ends it."""
     motion, held, artefacts = take.motion, take.held, take.artefacts
-    # frames that changes of the body are measured in
+    # 56 frames in which soft tissue is measured
     frames = spread_indices(len(take.shown.poses), 56)
     page = Page(f"{take.name}, with {'soft tissue' if take.soft else 'fixed shape'}",
                 "Dots are the measured markers: red where they are believed, orange where they are seen but not "
@@ -92,7 +95,7 @@ def take_page(take: Take, metrics: Sequence[Metric], picture: np.ndarray) -> Pag
                                 "as bad")
     page.bodies(pictures.take_frame_panes(take, worst_frames(take.shown, 5)), "the frames in which they are farthest",
                 300)
-    # the markers, the worst first, held-out ones above all
+    # a table of markers, the worst first, held-out ones on top
     rows = marker_rows(motion.labels, motion.residuals, None if take.soft is None else take.soft.motion.residuals,
                        motion.trusted)
     if held is not None:
@@ -112,6 +115,7 @@ def take_page(take: Take, metrics: Sequence[Metric], picture: np.ndarray) -> Pag
                     "frames that change most", 300)
     page.section("Marker artefacts", "The body says where each marker should be: one that is elsewhere was "
                  "swapped with another, has slipped, jitters or strays.")
+    # a table of artefacts, in order of time
     found = [("swapped", f"{e.first} and {e.second}", e.begin, e.end, (e.end - e.begin + 1) / motion.rate, np.nan)
              for e in artefacts.swaps]
     found += [(b.kind, b.label, b.begin, b.end, (b.end - b.begin + 1) / motion.rate, MM * b.distance)
@@ -131,25 +135,26 @@ def take_page(take: Take, metrics: Sequence[Metric], picture: np.ndarray) -> Pag
 
 
 def closing(page: Page, metrics: Sequence[Metric], settings: Mapping[str, Any]) -> Page:
-    """The end of a page: all figures and the settings."""
+    """End a page with all figures and settings."""
     page.section("Figures").figures(metrics)
     text = escape(json.dumps(storage.as_json(settings), indent=1))
     return page.markup(f"<details><summary>All settings</summary><pre><code>{text}</code></pre></details>")
 
 
 def person_picture(model: BodyModel, result: MoshResult) -> np.ndarray:
-    """A person from four sides with the markers, for the page of all people."""
+    """Render a person with the markers from four sides, for the page of all people."""
     body = pictures.person_in_mean_pose(model, result.betas)
     return pictures.picture_sides(body, result.layout.place(body))
 
 
 def take_picture(take: Take, count: int = 6) -> np.ndarray:
-    """Some frames of a sequence, for the page of its person."""
+    """Render some frames of a sequence, for the page of its person."""
     frames = np.unique(np.linspace(0, len(take.motion.poses) - 1, count + 2).round().astype(int)[1:-1])
     return pictures.picture_large(take, frames, 260)
 
 
 def _choose_frames(result: MoshResult, takes: Sequence[Take]) -> list[Pane]:
+    """Return the frames of the person's fit, each with its body and markers."""
     person, subject, light = result.person, takes[0].subject, takes[0].light
     panes, vertical = [], upwards(takes[0].shown, subject)
     for (number, t), pose, trans in zip(person.frames.tolist(), person.poses, person.trans, strict=True):
@@ -162,5 +167,5 @@ def _choose_frames(result: MoshResult, takes: Sequence[Take]) -> list[Pane]:
 
 
 def _main(metrics: Sequence[Metric]) -> list[Metric]:
-    """Those that tell how good a motion is."""
+    """Return the metrics of the quality of a motion."""
     return [m for m in metrics if m.unit == "mm" or m.name in ("frames", "swaps", "bad spans")]

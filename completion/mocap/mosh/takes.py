@@ -1,4 +1,4 @@
-"""One sequence of a person with all that was found of it, for files and pictures."""
+"""One sequence of a person with all its results, for files and pictures."""
 from __future__ import annotations
 
 from collections.abc import Sequence
@@ -22,7 +22,7 @@ from .recordings import Recording
 
 @dataclass(frozen=True, eq=False)
 class HeldOut:
-    """How far the body is (T, H), metres, from markers that no stage saw; `soft` with soft tissue, if any."""
+    """Distances (T, H), metres, of the body from held-out markers; `soft` with soft tissue, if any."""
 
     labels: tuple[str, ...]
     fixed: np.ndarray
@@ -30,13 +30,13 @@ class HeldOut:
 
     @property
     def shown(self) -> np.ndarray:
-        """(T, H) with soft tissue where there is one."""
+        """Distances (T, H) with soft tissue where there is one."""
         return self.fixed if self.soft is None else self.soft
 
 
 @dataclass(frozen=True, eq=False)
 class Take:
-    """One sequence of a person: where it was read from, what was found of it, and a body for small pictures."""
+    """One sequence of a person: its source, its results, and a light mesh for small pictures."""
 
     source: Recording
     unit: str | None
@@ -60,31 +60,32 @@ class Take:
         return self.motion if self.soft is None else self.soft.motion
 
     def bodies(self, frames: Sequence[int] | np.ndarray) -> np.ndarray:
-        """The meshes (n, N, 3) of some frames, metres, with soft tissue where there is one; made once each."""
+        """Return meshes (n, N, 3) of some frames, metres, with soft tissue where there is one; each is made once."""
         new = np.array([t for t in map(int, frames) if t not in self._kept], dtype=int)
         if len(new):
             self._kept.update(zip(new.tolist(), self.make(new).astype(np.float32), strict=True))
         return np.stack([self._kept[int(t)] for t in frames]).astype(float)
 
     def make(self, frames: np.ndarray) -> np.ndarray:
-        """As `bodies`, which are not kept."""
+        """Compute meshes (n, N, 3) of some frames, metres, without keeping them."""
         return self.motion.vertices(self.subject, frames) if self.soft is None else \
             self.soft.vertices(self.model, frames, subject=self.subject)
 
     def rigid(self, frames: Sequence[int] | np.ndarray) -> np.ndarray:
-        """The meshes (n, N, 3) of the same poses with the person's own shape."""
+        """Compute meshes (n, N, 3) of the same poses with the person's own shape, metres."""
         return self.shown.vertices(self.subject, np.asarray(frames)).astype(float)
 
 
 def measure_held_out(model: BodyModel, layout: MarkerLayout, labels: Sequence[str], markers: MarkerSequence,
                      motion: Motion,
                      soft: SoftTissue | None) -> HeldOut | None:
-    """How far a motion is from markers of the layout that it was not made from; None where there are none of them."""
+    """Measure the distance of a motion from held-out markers of the layout; None where there are none."""
     wanted = {layout.aliases.get(label, label) for label in labels}
     known = layout.match_labels(markers.labels, 0)
     names = tuple(label for label in known if layout.aliases.get(label, label) in wanted)
     if not names:
         return None
+    # simulated markers of the layout's places on the fixed shape, then with soft tissue
     places = layout.select(names)
     ids, weights = supports(model.template, places)
     lift, seen = np.asarray(places.distances), markers.select(names).positions

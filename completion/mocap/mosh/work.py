@@ -1,4 +1,4 @@
-"""One person: read the recordings, find the person and the motions, and write everything."""
+"""The work of `scape mosh` on one person: read recordings, find person and motions, write everything."""
 from __future__ import annotations
 
 import time
@@ -42,23 +42,23 @@ from .recordings import Actor, Recording
 from .report import closing, person_page, person_picture, take_page, take_picture
 from .takes import LightMesh, Take, measure_held_out
 
-# held out first; what soft tissue was fitted to is no error: its heads stay rigid, and little is left over
+# held-out errors first; what is left after soft tissue was fitted to the same markers is small, and no error
 ERRORS = ("held-out error, fixed shape", "held-out error, soft tissue", "markers to the body, fixed shape",
           "left over after soft tissue was fitted")
-FIXED = ERRORS[2]                    # that everybody has
-HALF = 100                           # of progress: finding shape and motion, then files and pictures
+FIXED = ERRORS[2]                    # the one that every person has
+HALF = 100                           # steps of progress for shape and motion, and as many for files and pictures
 
 
 @dataclass(frozen=True, eq=False)
 class MoshTask:
-    """The work on each person of a call."""
+    """The work on each person, with the settings of the call."""
 
     model: BodyModel
-    name: str                            # of the model, for the output
-    sexes: Mapping[str, BodyModel]       # of "female" and "male" people, for the sex that the model tells; or none
+    name: str                            # name of the model, for the output
+    sexes: Mapping[str, BodyModel]       # models of "female" and "male" people, or empty
     character: BodyModel | None
-    layout: tuple[MarkerLayout, str] | None          # with its name; else the named one that fits the labels best
-    hold_out: tuple[str, ...]            # labels that no stage sees
+    layout: tuple[MarkerLayout, str] | None          # with its name; None for the named one that fits labels best
+    hold_out: tuple[str, ...]            # labels of held-out markers
     unit: str | None
     rate: float | None                   # frames a second, where a file does not say
     unlabelled: bool                     # markers have no names
@@ -66,47 +66,46 @@ class MoshTask:
     command: str = field(metadata={"digest": False})
 
     def __call__(self, actor: Actor, room: TaskContext) -> tuple[list[Metric], list[str]]:
-        """Everything of one person into the folder of a room: the figures, and what failed.
+        """Process one person into the folder of a task; return the figures, judgement first, and failures.
 
-        A recording that cannot be read is left out and told; ValueError where none can. The first figure says
-        what the motions are worth.
+        A recording that cannot be read is left out and reported; ValueError where none can be read.
         """
         start, folder = clocks(), room.folder
-        found, failures = _solve(self, actor, room)
+        outcome, failures = _solve(self, actor, room)
         solved = clocks() - start
-        settings = {"mosh": self.config, "model": self.name, "layout": found.layout_name, "held out": self.hold_out}
+        settings = {"mosh": self.config, "model": self.name, "layout": outcome.layout_name, "held out": self.hold_out}
         # the person: betas and how they were found, where the markers sat
-        result, person = found.result, found.result.person
+        result, person = outcome.result, outcome.result.person
         storage.write_json(folder / "subject.json", {
-            "betas": result.betas.tolist(), "model": self.name, "layout": found.layout_name,
-            "held_out": self.hold_out, "sex": found.guess, "recordings": [r.path.name for r in actor.recordings],
+            "betas": result.betas.tolist(), "model": self.name, "layout": outcome.layout_name,
+            "held_out": self.hold_out, "sex": outcome.guess, "recordings": [r.path.name for r in actor.recordings],
             "frames": person.frames.tolist(),
             "moved": dict(zip(result.layout.labels, person.moved.tolist(), strict=True)),
-            "worn_elsewhere": {m.label: {"from_the_layout": m.before, "left": m.after} for m in result.worn.moved},
-            "exchanged": result.worn.exchanged, "left_out": result.worn.unplaced, "residual": person.residual,
-            "energies": person.energies, "converged": bool(person.converged)})
+            "misplaced": {m.label: {"from_the_layout": m.before, "left": m.after} for m in result.misplaced.moved},
+            "exchanged": result.misplaced.exchanged, "left_out": result.misplaced.unplaced,
+            "residual": person.residual, "energies": person.energies, "converged": bool(person.converged)})
         result.layout.save(folder / "layout.json")
-        # the sequences
+        # the sequences, each into its folder
         figures: dict[str, list[Metric]] = {}
-        pages, total = np.zeros(2), len(found.takes) + 1
-        for i, take in enumerate(found.takes):
+        pages, total = np.zeros(2), len(outcome.takes) + 1
+        for i, take in enumerate(outcome.takes):
             room.tell(HALF + HALF * i // total, 2 * HALF)
-            figures[take.name], seconds = _write(self, found, take, room, settings)
+            figures[take.name], seconds = _write(self, outcome, take, room, settings)
             pages += seconds
         room.tell(HALF + HALF * (total - 1) // total, 2 * HALF)
-        # the page
+        # judgement, figures and page of the person
         pages -= clocks()
-        judgement = found.judgement(found.takes)
-        metrics = [judgement_row(judgement), Metric("model", self.name), *_person_metrics(found),
-                   *_figures(found.takes)]
-        person_page(actor.name, found.model, result, found.usual, found.takes, metrics, figures,
+        judgement = outcome.judgement(outcome.takes)
+        metrics = [judgement_row(judgement), Metric("model", self.name), *_person_metrics(outcome),
+                   *_figures(outcome.takes)]
+        person_page(actor.name, outcome.model, result, outcome.usual, outcome.takes, metrics, figures,
                     settings).write(folder / "report.html")
-        save_png(folder / PICTURE, person_picture(found.model, result))
+        save_png(folder / PICTURE, person_picture(outcome.model, result))
         pages += clocks()
-        # how long the stages took, those done in an earlier run too; not on the page, which is always the same
+        # run times of the stages, including kept ones; not on the page, which must not change from run to run
         whole = clocks() - start
         stages = {**result.seconds, "files": whole - solved - pages, "pages": pages, "all": whole}
-        count = sum(len(take.motion.poses) for take in found.takes)
+        count = sum(len(take.motion.poses) for take in outcome.takes)
         metrics += details([
             *(Metric(f"{stage}, {what}", float(seconds[i]), "s") for i, what in
               ((1, "processor time"), (0, "time by the clock")) for stage, seconds in stages.items()),
@@ -118,7 +117,7 @@ class MoshTask:
 
 @dataclass(frozen=True, eq=False)
 class _Found:
-    """A person."""
+    """The results for one person."""
 
     model: BodyModel
     guess: SexGuess | None
@@ -126,32 +125,34 @@ class _Found:
     takes: list[Take]
     usual: MarkerLayout
     layout_name: str
-    labelling: Judgement                 # of labels that were found
+    labelling: Judgement                 # of labels that were found for unlabelled recordings
 
     @cached_property
     def person(self) -> Judgement:
-        """Whether the body is one that a person can have."""
+        """Judgement of the body: whether a person can have it."""
         return person_judgement(self.model, self.result.betas)
 
     @cached_property
     def covered(self) -> Coverage:
-        """What the markers of all sequences tell of the body."""
+        """Which parts of the body the markers of all sequences determine."""
         return find_coverage(self.takes[0].subject, self.result.layout, [take.motion for take in self.takes],
                              [take.markers for take in self.takes])
 
     def judgement(self, takes: Sequence[Take]) -> Judgement:
-        """What the person and the motions of some sequences are worth."""
+        """Judge the person and the motions of some sequences."""
         body, result, several = self.model.template, self.result, len(takes) > 1
         motions = [take.motion for take in takes]
         problems = [(f"{take.name}: " if several else "") + why for take in takes if (why := motion_problem(
             take.motion, take.subject.template, result.layout, take.markers))]
         moving = Judgement.of(problems, motion_doubts(motions, [take.markers for take in takes], body))
-        own = self.covered.judgement().merge(self.labelling, moving, result.worn.judgement(self.usual.labels),
+        own = self.covered.judgement().merge(self.labelling, moving, result.misplaced.judgement(self.usual.labels),
                                              result.person.judgement(self.usual))
         return judge_motions(self.person, own, motions, body)
 
 
 def _solve(work: MoshTask, actor: Actor, room: TaskContext) -> tuple[_Found, list[str]]:
+    """Read the recordings of a person and run `mosh`; return the results and what could not be read."""
+    # recordings, labelled first where markers have no names
     recordings, sequences, failures = list[Recording](), list[MarkerSequence](), list[str]()
     labelling, units = list[Judgement](), list[str | None]()
     for recording in actor.recordings:
@@ -173,6 +174,7 @@ def _solve(work: MoshTask, actor: Actor, room: TaskContext) -> tuple[_Found, lis
             failures.append(" ".join(str(error).split()))
     if not sequences:
         raise ValueError("; ".join(failures))
+    # the layout for these labels, without held-out markers
     labels = tuple(dict.fromkeys(label for each in sequences for label in each.labels))
     usual, layout_name = work.layout or choose_layout(work.model, None, labels)
     usual = usual.with_spellings(labels)
@@ -186,10 +188,11 @@ def _solve(work: MoshTask, actor: Actor, room: TaskContext) -> tuple[_Found, lis
         room.tell(HALF * done // total, 2 * HALF)
 
     if work.sexes:
-        told = mosh_by_sex({"neutral": work.model, **work.sexes}, sequences, layout, work.config, progress, room.step)
-        model, guess, result = told.model, told.guess, told.result
+        by_sex = mosh_by_sex({"neutral": work.model, **work.sexes}, sequences, layout, work.config, progress, room.step)
+        model, guess, result = by_sex.model, by_sex.guess, by_sex.result
     else:
         result = mosh(model, sequences, layout, work.config, progress, room.step)
+    # a take for each sequence, with distances from held-out markers
     subject = model.subject(result.betas)
     light, takes = LightMesh.of(model.template), []
     for i, (source, unit, markers) in enumerate(zip(recordings, units, sequences, strict=True)):
@@ -202,7 +205,7 @@ def _solve(work: MoshTask, actor: Actor, room: TaskContext) -> tuple[_Found, lis
 
 def _write(work: MoshTask, found: _Found, take: Take, room: TaskContext, settings: Mapping[str, Any]
            ) -> tuple[list[Metric], np.ndarray]:
-    """A sequence into its folder, in steps that are kept; the figures, and the seconds (2,) of the page."""
+    """Write a sequence into its folder, in steps that are kept; return figures and times (2,) of the page, seconds."""
     metrics, factor = [Metric("layout", found.layout_name), *_figures([take])], work.config.exaggeration
     solved = found.model, take.markers, take.motion, take.soft, take.artefacts, take.held
 
@@ -225,10 +228,10 @@ def _write(work: MoshTask, found: _Found, take: Take, room: TaskContext, setting
         outcome = Outcome(place(folder), metrics, settings, judgement=judgement)
         write_report(outcome, work.command, time.perf_counter() - start)
 
-    told = found.covered.told
+    determined = found.covered.told
     metrics += room.files(f"{take.name} files",
-                          (solved, told, take.source.path, take.source.who, take.unit, factor),
-                          lambda folder: write_take(place(folder), take, told, factor))
+                          (solved, determined, take.source.path, take.source.who, take.unit, factor),
+                          lambda folder: write_take(place(folder), take, determined, factor))
     shown: list[Any] = []
     if (body := work.character) is not None:
         *shown, exact = room.files(f"{take.name} character", (solved, body, factor),
@@ -240,10 +243,10 @@ def _write(work: MoshTask, found: _Found, take: Take, room: TaskContext, setting
 
 
 def write_take(folder: Path, take: Take, told: np.ndarray | None = None, factor: float = 1.0) -> list[Metric]:
-    """All files of a sequence but its page; exaggerated.glb where the factor on soft tissue is not 1.
+    """Write all files of a sequence but its page; exaggerated.glb only for a factor on soft tissue other than 1.
 
-    Angles and joint centres between parts of which the markers do not tell (`told` (J,) bool) are left out.
-    Returned is how far the GLB files are from the exact bodies.
+    Angles and joint centres between parts that the markers do not determine (`told` (J,) bool) are left out.
+    Returned is the distance of the GLB files from the exact bodies.
     """
     motion, body, soft = take.motion, take.subject, take.soft
     write_motion_folder(folder, motion, body, take.artefacts.virtual(), told)
@@ -254,12 +257,13 @@ def write_take(folder: Path, take: Take, told: np.ndarray | None = None, factor:
         if factor != 1:
             exact += write_glb(folder / "exaggerated.glb", soft.motion, body,
                                partial(soft.vertices, take.model, factor=factor, subject=body))
+    # virtual markers: gaps filled, with joint centres, in a copy of a C3D recording
     path = take.source.path
     write_virtual(folder / "virtual.c3d", take.artefacts, path if path.suffix.lower() == ".c3d" else None,
                   take.source.who, take.unit,
                   centre_sequence(mask_unknown_centres(joint_centres(motion, body), body.skeleton, told), body.skeleton,
                                   motion.rate))
-    # swapped labels, bad spans and how much was filled in, and the spans as a table
+    # artefacts as JSON, and the spans as a table
     storage.write_json(folder / "artefacts.json", artefact_table(take.artefacts))
     rows: list[tuple[str, str, int, int, str]] = [
         *(("swapped", f"{s.first} {s.second}", s.begin, s.end, "") for s in take.artefacts.swaps),
@@ -270,7 +274,7 @@ def write_take(folder: Path, take: Take, told: np.ndarray | None = None, factor:
 
 
 def _character(character: BodyModel, take: Take, folder: Path, factor: float) -> tuple[np.ndarray, str, list[Metric]]:
-    """The motion on a character: character.npz, character.glb; a picture, what it shows, how exact the GLB is."""
+    """Write the motion on a character; return a picture, its caption, and the error of the GLB."""
     if take.soft is not None:
         moving = retarget_soft_tissue(take.soft, take.model, character, factor)
         moving.save(folder / "character.npz")
@@ -286,13 +290,14 @@ def _character(character: BodyModel, take: Take, folder: Path, factor: float) ->
 
 
 def _person_metrics(found: _Found) -> list[Metric]:
+    """Return the figures of a person: size, sex, markers, betas."""
     moved, result = MM * found.result.person.moved, found.result
     body = person_in_mean_pose(found.model, result.betas)
     told = [Metric("height", float(np.ptp(body.vertices[:, guess_upright(body)[0]])), "m"),
             Metric("volume", 1000 * abs(body.volume), "l")]
     if found.guess is not None:
         told.append(Metric("sex", f"{found.guess.sex} ({100 * found.guess.probability:.0f}%)"))
-    return [*told, *found.covered.metrics(), *result.worn.metrics(), *result.person.metrics(found.usual),
+    return [*told, *found.covered.metrics(), *result.misplaced.metrics(), *result.person.metrics(found.usual),
             Metric("markers beside the layout's places, mean", float(moved.mean()), "mm"),
             *details([Metric("layout", found.layout_name), Metric("sequences", len(found.takes)),
                       Metric("body shape from the mean person, length of the betas",
@@ -302,7 +307,7 @@ def _person_metrics(found: _Found) -> list[Metric]:
 
 
 def _figures(takes: Sequence[Take]) -> list[Metric]:
-    """What motions are judged by, of all frames together."""
+    """Return the figures of some sequences, over all their frames together."""
     out = list[Metric]()
     fixed = [t.motion.residuals_of_trusted() for t in takes]
     soft = [np.where(np.isnan(t.motion.residuals_of_trusted()), np.nan,
@@ -312,6 +317,7 @@ def _figures(takes: Sequence[Take]) -> list[Metric]:
     for name, values in zip(ERRORS, ([h.fixed for h in held], held_soft, fixed, soft), strict=True):
         if values:
             out.append(Metric(name, MM * float(np.nanmean(np.concatenate([v.ravel() for v in values]))), "mm"))
+    # counts of missing, bad and filled positions
     missing = sum(int((~t.markers.select(t.artefacts.labels).seen).sum()) for t in takes)
     filled = sum(sum(artefact_table(t.artefacts)["filled"].values()) for t in takes)
     share = 100 / max(sum(t.artefacts.simulated[..., 0].size for t in takes), 1)

@@ -1,4 +1,4 @@
-"""Motion of a known body from markers: a few frames one after the other, then all as a whole; a low-pass filter."""
+"""Motion of a known body from markers: key frames in sequence, then all frames together; a low-pass filter."""
 from __future__ import annotations
 
 from collections.abc import Sequence
@@ -20,42 +20,62 @@ from .swaps import label_order
 
 __all__ = ["AnimateConfig", "animate"]
 
-STILL = 0.005                        # metres that the last round moves any marker of a frame that has converged
+STILL = 0.005                        # metres: a frame has converged when the last round moves no marker farther
 
 
 @one_thread()
 def animate(subject: Subject, markers: MarkerSequence, layout: MarkerLayout, config: AnimateConfig | None = None,
             progress: Progress | None = None, near: Motion | None = None) -> Motion:
-    """The motion of a body that carries markers.
+    """Compute the motion of a body of known shape from its markers.
 
-    Key frames are followed one after the other, each from a prediction. All frames between them begin on the
-    way from key to key and are solved together, coupled by how strongly a body accelerates. Markers that are
-    missing count nothing, those far off count little, and labels that two have swapped are put right.
+    Key frames are solved in sequence, each from a prediction. The frames between them start from interpolated poses and
+    are solved together, with a prior on accelerations. Missing markers have no weight, outliers little, and swapped
+    labels are corrected.
 
     Parameters
     ----------
     subject : Subject
         The person, of known shape.
     markers : MarkerSequence
+        Positions (T, L, 3) in metres.
     layout : MarkerLayout
-        Where on the body the markers sit. Markers that only one of the two knows are left out.
+        Where on the body the markers sit. Markers that are only in one of the two are left out.
     config : AnimateConfig, optional
+        Settings.
     progress : callable, optional
         Called with (done, total) frames.
     near : Motion, optional
-        Of nearly this body with nearly these markers, to begin with instead of key frames.
+        Motion of nearly this body with nearly these markers, as the initialisation in place of key frames.
+
+    Returns
+    -------
+    Motion
+        Poses (T, J, 3) in radians, trans (T, 3) in metres, residuals (T, L) in metres of every marker of the sequence.
 
     Raises
     ------
     ValueError
         Fewer than 3 markers in common, no frame with 3 of them, a layout of another body.
 
+    Examples
+    --------
+    >>> from completion import load_layout
+    >>> from model import load_built_in_model
+    >>> model = load_built_in_model()
+    >>> layout = load_layout("cmu41", model.template, np.array(model.info["people_vertices"]))
+    >>> still = MarkerSequence(np.stack([layout.place(model.template)] * 5), layout.labels, 120.0)
+    >>> motion = animate(model.subject(), still, layout)
+    >>> motion.poses.shape, bool(motion.residuals.max() < 0.005)
+    ((5, 16, 3), True)
+
     [SCAPE] §8
     """
     config, tell = config or AnimateConfig(), progress or (lambda done, total: None)
-    columns, worn = layout.match_columns(markers.labels)
+    # the markers that sequence and layout have in common, on the body
+    columns, known_layout = layout.match_columns(markers.labels)
     targets = markers.positions[:, columns]
-    body = MarkedBody(subject, worn, config.prior_weight, config.prior_shrinkage)
+    body = MarkedBody(subject, known_layout, config.prior_weight, config.prior_shrinkage)
+    # all frames together, or one after the other
     if config.smoothing or config.ground:
         start = None if near is None else body.body.join(near.poses, near.trans)
         x, order, converged = follow_whole(body, targets, markers.rate, config, tell, start)
@@ -64,20 +84,21 @@ def animate(subject: Subject, markers: MarkerSequence, layout: MarkerLayout, con
     pose, trans, _ = body.body.split(x)
     if config.low_pass:
         pose, trans = low_pass(pose, trans, markers.rate, config.low_pass)
+    # residuals of the markers of the layout, NaN for the others
     residuals = np.full(markers.positions.shape[:2], np.nan)
     believed = np.zeros(residuals.shape, dtype=bool)
-    residuals[:, columns], believed[:, columns] = judge_markers(body.positions(body.body.join(pose, trans)), targets,
-                                                                order,
-                                                                config.outlier)
+    simulated = body.positions(body.body.join(pose, trans))
+    residuals[:, columns], believed[:, columns] = judge_markers(simulated, targets, order, config.outlier)
     return Motion(pose.copy(), trans.copy(), subject.betas, markers.rate, residuals, markers.labels,
                   converged=converged, trusted=believed)
 
 
 def follow_frames(body: MarkedBody, targets: np.ndarray, frames: np.ndarray, rate: float, config: AnimateConfig,
                   tell: Progress, steps: int = STEPS) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Some frames, `rate` of them a second, each from those before: begins at a whole one and goes both ways.
+    """Solve some frames in sequence, `rate` of them a second: from the first full frame forwards, then backwards.
 
-    Found are unknowns (n, P), the columns of targets (T, L, 3) of each marker (n, L), and which frames converged (n,).
+    Returned are unknowns (n, P), the columns of targets (T, L, 3) of each marker (n, L), and which frames converged
+    (n,).
     """
     first = _first_frame(targets)
     x, converged = np.empty((len(frames), body.n_unknowns)), np.zeros(len(frames), dtype=bool)
@@ -97,22 +118,22 @@ def follow_frames(body: MarkedBody, targets: np.ndarray, frames: np.ndarray, rat
 
 def follow_whole(body: MarkedBody, targets: np.ndarray, rate: float, config: AnimateConfig, tell: Progress,
                  start: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """All frames together: unknowns (T, P), the order of the labels (T, L), and which frames converged (T,).
+    """Solve all frames together; return unknowns (T, P), the order of labels (T, L) and which frames converged (T,).
 
-    They begin at unknowns `start` (T, P), or on the way from key to key.
+    The initialisation is `start` (T, P), or poses interpolated between key frames.
     """
     T, stiffness = len(targets), config.inertia(rate, body.n_unknowns)
     x = between_keys(body, targets, rate, config) if start is None else start.copy()
     moved, feet, inside = np.zeros(T), None, span_with_markers(targets)
     free = max(config.smoothing, 1)
-    rounds = free + 2 * (config.ground and T > 2)                       # the last ones with the feet held
+    rounds = free + 2 * (config.ground and T > 2)                       # two more rounds with foot contact
     for i in range(rounds):
         if i == free:
             feet = FootContact(body, x, rate, config.floor)
-        # swapped labels are put right, lost limbs found again, and outliers lose their weight
+        # swapped labels are corrected, lost limbs initialised again, and outliers lose their weight
         order = label_order(body.positions(x), targets, rate, config.outlier)
         taken = np.take_along_axis(targets, order[..., None], axis=1)[inside]
-        near = reinitialise_frames(body, x[inside].copy(), taken, config)         # x changes below, and is compared
+        near = reinitialise_frames(body, x[inside].copy(), taken, config)         # a copy: x changes below
         weights, _ = marker_weights(body.positions(near), taken, config.marker_sd, config.outlier)
 
         # one step of all frames together
@@ -124,25 +145,27 @@ def follow_whole(body: MarkedBody, targets: np.ndarray, rate: float, config: Ani
 
 
 def between_keys(body: MarkedBody, targets: np.ndarray, rate: float, config: AnimateConfig) -> np.ndarray:
-    """Unknowns (T, P) on the way from one key frame to the next, which are followed one after the other."""
-    T, every = len(targets), max(1, round(0.1 * rate))  # seconds between the frames that are solved one after the other
+    """Solve key frames in sequence, and interpolate unknowns (T, P) between them."""
+    # 0.1 seconds between key frames; the first and the last frame are key frames too
+    T, every = len(targets), max(1, round(0.1 * rate))
     frames = np.unique(np.r_[0, np.arange(_first_frame(targets) % every, T, every), T - 1])
     keys, _, _ = follow_frames(body, targets, frames, rate / every, config, lambda done, total: None, steps=8)
     if len(frames) == 1:
         return keys
+    # each frame a share of the step from the key before it to the key after it
     i = np.clip(np.searchsorted(frames, np.arange(T), side="right") - 1, 0, max(0, len(frames) - 2))
     share = (np.arange(T) - frames[i]) / (frames[i + 1] - frames[i])
     return body.retract(keys[i], share[:, None] * body.step_to(keys[i], keys[i + 1]))
 
 
 def span_with_markers(targets: np.ndarray) -> slice:
-    """From the first to the last frame in which any of the markers (T, L, 3) was seen."""
-    some = np.flatnonzero(~np.isnan(targets[..., 0]).all(axis=1))
-    return slice(int(some[0]), int(some[-1]) + 1)
+    """Return the slice from the first to the last frame in which any of the markers (T, L, 3) was seen."""
+    seen = np.flatnonzero(~np.isnan(targets[..., 0]).all(axis=1))
+    return slice(int(seen[0]), int(seen[-1]) + 1)
 
 
 def _first_frame(targets: np.ndarray) -> int:
-    """The first frame with nearly as many markers as ever."""
+    """Return the first frame with at least 90% of the markers of the fullest frame; ValueError below 3."""
     seen = (~np.isnan(targets[..., 0])).sum(axis=1)
     if seen.max(initial=0) < 3:
         raise ValueError(f"markers: expected a frame with at least 3 known markers, the best has {seen.max(initial=0)}")
@@ -150,9 +173,9 @@ def _first_frame(targets: np.ndarray) -> int:
 
 
 def low_pass(pose: np.ndarray, trans: np.ndarray, rate: float, cutoff: float) -> tuple[np.ndarray, np.ndarray]:
-    """Poses (T, J, 3) and trans (T, 3) without what is faster than a frequency, hertz: Butterworth, there and back.
+    """Filter poses (T, J, 3) and trans (T, 3) by a low-pass without lag: Butterworth of order 2, forth and back.
 
-    Rotations are filtered as unit quaternions of continuous sign, which have no jump at a half turn.
+    `cutoff` is in hertz. Rotations are filtered as unit quaternions of continuous sign, without a jump at a half turn.
     """
     from scipy.signal import butter, sosfiltfilt
 
@@ -161,6 +184,7 @@ def low_pass(pose: np.ndarray, trans: np.ndarray, rate: float, cutoff: float) ->
     sections = butter(2, cutoff, fs=rate, output="sos")
     if len(pose) <= 3 * (2 * len(sections) + 1):
         raise ValueError(f"low_pass: expected more than {3 * (2 * len(sections) + 1)} frames, got {len(pose)}")
+    # quaternions whose sign changes wherever two successive ones point apart
     q = Rotation.from_rotvec(pose.reshape(-1, 3)).as_quat().reshape(*pose.shape[:2], 4)
     turned = np.einsum("tjc,tjc->tj", q[1:], q[:-1]) < 0
     q[1:] *= np.where(np.cumsum(turned, axis=0) % 2, -1.0, 1.0)[..., None]

@@ -1,4 +1,4 @@
-"""What motions from markers are worth: markers that are not believed, and frames that cannot be."""
+"""Judge motions from markers: distrusted markers, implausible speed, a body far from its markers."""
 from __future__ import annotations
 
 from collections.abc import Sequence
@@ -15,7 +15,7 @@ from ..marker_sets.layout import MarkerLayout
 
 
 def markers_told(motions: Sequence[Motion]) -> Metric:
-    """Over which markers the mean distance of motions of one body is taken."""
+    """Return which markers are in the mean distance of motions of one body."""
     seen = {label for motion in motions for label, column in zip(motion.labels, motion.residuals.T, strict=True)
             if np.isfinite(column).any()}
     out = sorted({label for motion in motions for label in motion.distrusted})
@@ -24,55 +24,55 @@ def markers_told(motions: Sequence[Motion]) -> Metric:
 
 
 def distrusted_marker_warnings(motions: Sequence[Motion]) -> tuple[str, ...]:
-    """A reason to look at motions of one body: markers that are distrusted throughout."""
+    """Return a doubt for markers that are distrusted throughout the motions of one body."""
     out = sorted({label for motion in motions for label in motion.distrusted})
     return (f"{', '.join(out)} hardly ever believed: not worn where the layout says, and not in the mean distance",
             ) if out else ()
 
 
 def hardly_seen(motions: Sequence[Motion]) -> tuple[str, ...]:
-    """A reason to look at motions: most of their frames show too few markers to place a body."""
-    few = sum(int((np.isfinite(motion.residuals).sum(axis=1) < 3).sum()) for motion in motions)
+    """Return a doubt where most frames show too few markers to place a body."""
+    sparse = sum(int((np.isfinite(motion.residuals).sum(axis=1) < 3).sum()) for motion in motions)
     frames = sum(len(motion.residuals) for motion in motions)
-    return (f"{few} of {frames} frames show fewer than 3 markers: the body there is carried over from the others",
-            ) if few > frames / 2 else ()
+    return (f"{sparse} of {frames} frames show fewer than 3 markers: the body there is carried over from the others",
+            ) if sparse > frames / 2 else ()
 
 
 def judge_motions(person: Judgement, own: Judgement, motions: Sequence[Motion], body: Mesh) -> Judgement:
-    """What motions are worth, by themselves and by the `person` that was found from the same markers.
+    """Merge the judgement of motions with that of the `person` found from the same markers.
 
-    On a body that is nowhere near its markers, the size of the person is no cause but an effect, and told last.
+    For a body far from its markers, a strange size of the person is an effect and not the cause, so it comes last.
     """
     return own.merge(person) if mean_off(motions) > HAND * size(body) else person.merge(own)
 
 
 def mean_off(motions: Sequence[Motion]) -> float:
-    """Mean distance of all markers from where the body has them, metres; 0 without any."""
-    found = [motion.residuals[np.isfinite(motion.residuals)] for motion in motions]
-    return float(np.concatenate(found).mean()) if any(map(len, found)) else 0.0
+    """Compute the mean distance of all markers from their simulated places, metres; 0 without any."""
+    seen = [motion.residuals[np.isfinite(motion.residuals)] for motion in motions]
+    return float(np.concatenate(seen).mean()) if any(map(len, seen)) else 0.0
 
 
 def motion_doubts(motions: Sequence[Motion], markers: Sequence[MarkerSequence], body: Mesh) -> tuple[str, ...]:
-    """Reasons to look at motions of one body, made from markers; `body` is the model's template."""
+    """Return reasons to look at motions of one body from markers; `body` is the model's template."""
     reasons = [*hardly_seen(motions), *distrusted_marker_warnings(motions)]
     off = mean_off(motions)
-    # of the size, 25 mm on a man; good motions are 4 to 25 mm off, shuffled frames 31
+    # 0.018 of the size, 25 mm on a man: good motions are 4 to 25 mm off, shuffled frames 31
     if off > 0.018 * size(body):
         reasons.append(f"the markers are {1000 * off:.0f} mm from where the body has them")
     return (*filter(None, (haste(one, body) for one in markers)), *reasons)
 
 
 def haste(markers: MarkerSequence, body: Mesh) -> str | None:
-    """Why markers of a recording cannot have moved so, with the likely cause; None where they can."""
-    # Sizes a second at which the median marker moves, 7 m/s on a man. Walking has 1, running 4; a walk told ten times
-    # too fast 12, one with shuffled frames 15. Noise of a millimetre moves a marker by 0.05 m/s.
+    """Return why the markers of a recording move too fast, with the likely cause, or None."""
+    # 5 sizes a second, 7 m/s on a man, for the median marker. Walking has 1, running 4; a walk with ten times its rate
+    # 12, one with shuffled frames 15. Noise of a millimetre moves a marker by 0.05 m/s.
     speed = marker_speed(markers)
     return f"the markers move at {speed:.0f} m/s: frames in another order, or the wrong rate?" \
         if speed > 5.0 * size(body) else None
 
 
 def marker_speed(markers: MarkerSequence) -> float:
-    """Median speed of all markers, metres per second, over steps of about a thirtieth of a second."""
+    """Compute the median speed of all markers, metres per second, over steps of about 1/30 s."""
     step = max(1, round(markers.rate / 30))
     moved = np.linalg.norm(markers.positions[step:] - markers.positions[:-step], axis=2)
     known = moved[np.isfinite(moved)]
@@ -80,18 +80,19 @@ def marker_speed(markers: MarkerSequence) -> float:
 
 
 def motion_problem(motion: Motion, body: Mesh, layout: MarkerLayout, markers: MarkerSequence) -> str | None:
-    """Why a motion from markers of a layout means nothing, and the likely cause; `body` is the model's template."""
+    """Return why a motion from markers means nothing, with the likely cause, or None; `body` is the template."""
     seen = np.isfinite(motion.residuals)
     if not seen.any():
         return "no marker of the layout was ever seen: markers of another layout?"
+    # the size of the box of markers tells a wrong unit; at most some 50 frames are looked at
     known = layout.match_labels(markers.labels, 0)
     columns = [markers.labels.index(label) for label in known]
-    some = markers.positions[:: max(1, len(seen) // 50), columns]
-    whole = np.isfinite(some[..., 0]).sum(axis=1)
-    # the median of frames that show most markers: a ghost of one frame makes its box as large as it likes
-    spans = [extent(frame) for frame in some[whole >= 0.9 * whole.max()]]
+    sampled = markers.positions[:: max(1, len(seen) // 50), columns]
+    counts = np.isfinite(sampled[..., 0]).sum(axis=1)
+    # the median over full frames: a ghost marker makes the box of its frame arbitrarily large
+    spans = [extent(frame) for frame in sampled[counts >= 0.9 * counts.max()]]
     wrong = unit_problem(float(np.nanmedian(spans)), extent(layout.select(known).place(body)), "the markers span a box")
-    # of the size, 34 mm on a man; good motions 4 to 25, sides swapped 36 to 60
+    # 0.025 of the size, 34 mm on a man: good motions are 4 to 25 mm off, those with swapped sides 36 to 60
     off, far = float(motion.residuals[seen].mean()), 0.025 * size(body)
     if wrong is None and off <= far:
         return None

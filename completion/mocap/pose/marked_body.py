@@ -1,9 +1,9 @@
-"""A body that carries markers: the inner loop of animation, with the pose prior and the normals that lift markers.
+"""Body with markers: the inner loop of animation, with the pose prior and the normals that lift markers off the skin.
 
-How far each marker is believed is told here as well: outliers lose their weight.
+The robust weights of markers are here as well: outliers lose their weight.
 
-Derivatives are by small rotations of every joint from the right, `R_parent exp(pose) exp(d)`, so that no chart ends at
-a half turn.
+Derivatives are by small rotations d of every joint from the right, `R_parent exp(pose) exp(d)`, so that nothing special
+happens at a half turn.
 """
 from __future__ import annotations
 
@@ -28,9 +28,9 @@ from ...smoothing import inertia, solve_coupled_steps
 from ..marker_sets.layout import MarkerLayout
 from .part_shapes import PartShapes, part_shapes
 
-BATCH = 64                           # frames whose parts are held at once
-MOST = 512                           # frames that are solved, each by itself, at once
-RATE = 120.0                         # frames per second for which the weight of the velocity is meant
+BATCH = 64                           # frames whose derivatives are in memory at once
+MOST = 512                           # frames that are solved at once, each by itself
+RATE = 120.0                         # frames per second for which [MoSh] means the weight of the velocity
 
 
 @dataclass(frozen=True)
@@ -40,26 +40,33 @@ class AnimateConfig(Settings):
     Attributes
     ----------
     marker_sd : float, metres
-        How far a marker lies from where the body would put it.
+        Standard deviation of a marker from its simulated place.
     outlier : float, metres
-        Residual at which a marker has lost three quarters of its weight, at least; on a body that fits badly
-        it is three times the median residual.
+        Residual at which a marker has lost three quarters of its weight, at least. On a body that fits badly it grows
+        to three times the median residual.
     prior_weight : float
-        Factor on the pose prior: small, it speaks for joints that no marker sees.
+        Factor on the pose prior. It is small, so the prior matters only for joints that no marker sees.
     prior_shrinkage : float in [0, 1]
         See `gaussian_prior`.
     angle_acceleration : float, radians per second squared
-        How strongly joints accelerate, as a standard deviation.
+        Standard deviation of the acceleration of joint angles.
     place_acceleration : float, metres per second squared
-        The same for the place.
+        Standard deviation of the acceleration of the place.
     smoothing : int
         Rounds over the whole sequence; 0 leaves the frame-by-frame solution.
     low_pass : float, hertz
         Cut-off of a Butterworth filter without lag on the result; 0 is none.
     ground : bool
-        Feet do not sink into the floor and do not slide while they stand on it.
+        Foot contact: feet do not sink into the floor and do not slide while they stand on it.
     floor : four numbers, optional
         A unit normal that points up, and the height of the floor along it, metres; else both come from the motion.
+
+    Examples
+    --------
+    >>> AnimateConfig(ground=True).smoothing
+    2
+
+    [SCAPE] §8
     """
 
     marker_sd: Positive = 0.01
@@ -74,14 +81,14 @@ class AnimateConfig(Settings):
     floor: tuple[Signed, Signed, Signed, Signed] | None = None
 
     def inertia(self, rate: float, n_unknowns: int) -> np.ndarray:
-        """Information (P,) of the change of velocity from frame to frame."""
+        """Compute the information (P,) of the change of velocity from frame to frame."""
         return inertia(n_unknowns, rate, self.angle_acceleration, self.place_acceleration)
 
 
 class MarkedBody:
-    """A body of known shape with markers; unknowns are x = (pose (3J), trans (3)).
+    """Body of known shape with markers; unknowns are x = (pose (3J), trans (3)).
 
-    A step (P,) rotates every joint from the right, `exp(pose) exp(d)`, so that nothing happens at a half turn.
+    A step (P,) rotates every joint from the right, `exp(pose) exp(d)`, so a half turn is nothing special.
     """
 
     def __init__(self, subject: Subject, layout: MarkerLayout, prior_weight: float, prior_shrinkage: float) -> None:
@@ -94,7 +101,7 @@ class MarkedBody:
         self._precision = prior_weight * self.prior.whitening.T @ self.prior.whitening
 
     def positions(self, x: np.ndarray) -> np.ndarray:
-        """Where the body puts the markers (..., L, 3), metres, for unknowns (..., P)."""
+        """Compute the simulated markers (..., L, 3), metres, for unknowns (..., P)."""
         pose, trans, _ = self.body.split(x.reshape(-1, x.shape[-1]))
         y = np.empty((len(pose), self.count, 3))
         for some in batches(len(pose)):
@@ -102,13 +109,13 @@ class MarkedBody:
         return y.reshape(*x.shape[:-1], self.count, 3)
 
     def system(self, x: np.ndarray, targets: np.ndarray, weights: np.ndarray, stiff: float = 1.0) -> Dense:
-        """Markers (B, L, 3), weighted (B, L), and the pose prior, with a factor, at unknowns (B, P). [SCAPE] §8"""
+        """Build the equations of markers (B, L, 3), weights (B, L), and `stiff` times the pose prior at x (B, P)."""
         pose, trans, _ = self.body.split(x)
         return self.with_prior(point_system(*self.shapes.columns(pose, trans), targets, weights), pose, stiff)
 
     def solve(self, x: np.ndarray, targets: np.ndarray, weights: np.ndarray, iterations: int, tolerance: float,
               stiff: float = 1.0) -> Minimum[np.ndarray]:
-        """The best unknowns near x (B, P), each row by itself; arguments as of `system`, without B if all are alike."""
+        """Solve for unknowns near x (B, P), each row by itself; arguments of `system`, without B if equal for all."""
         targets, weights = (np.broadcast_to(of, (len(x), *of.shape[-k:])) for of, k in ((targets, 2), (weights, 1)))
         ends = [levenberg_marquardt(partial(self.system, targets=targets[some], weights=weights[some], stiff=stiff),
                                     x[some], iterations, tolerance, retract=self.retract)
@@ -119,28 +126,30 @@ class MarkedBody:
             np.concatenate([end.converged for end in ends]), max(end.iterations for end in ends))
 
     def with_prior(self, data: Dense, pose: np.ndarray, stiff: float = 1.0) -> Dense:
-        """Equations whose first unknowns are those of poses (B, J, 3), and the pose prior."""
+        """Add the pose prior to equations whose first unknowns are those of poses (B, J, 3)."""
         pose, (energy, gradient, hessian) = twists(pose), data
         B, n = len(pose), self.body.n_angles
-        local = rotations.inverse_right_jacobian(pose)                                           # dpose = local d
+        # a joint that turns by d from the right changes its pose vector by dpose = local d
+        local = rotations.inverse_right_jacobian(pose)
         off = pose.reshape(B, n) - self.prior.mean
         precision = stiff * self._precision
         pull = off @ precision
         gradient[:, :n] += (pull.reshape(B, -1, 1, 3) @ local).reshape(B, n)
+        # localᵀ precision local, block by block of joints
         half = precision.reshape(n, -1, 3).swapaxes(0, 1) @ local                          # (B, J, n, 3)
         half = half.reshape(B, -1, n // 3, 3, 3).swapaxes(-1, -2)                                # transposed rows
         hessian[:, :n, :n] += (half @ local[:, None]).transpose(0, 1, 3, 2, 4).reshape(B, n, n)
         return Dense(energy + (pull * off).sum(axis=1), gradient, hessian)
 
     def retract(self, x: np.ndarray, step: np.ndarray) -> np.ndarray:
-        """The unknowns (..., P) after a step (..., P); poses come out at most a half turn long."""
+        """Apply a step (..., P) to unknowns (..., P); pose vectors come out at most a half turn long."""
         return retract_pose(self.body.n_angles)(x, step)
 
     def smooth_step(self, x: np.ndarray, stiffness: np.ndarray, system: Callable[..., Dense], *of_frames: np.ndarray
                     ) -> np.ndarray:
-        """Frames (T, P) that follow each other after one Gauss-Newton step, coupled as of `solve_coupled_steps`.
+        """Take one Gauss-Newton step of successive frames (T, P), coupled over time by `solve_coupled_steps`.
 
-        `system` makes the equations of some frames from their unknowns and their rows of `of_frames`.
+        `system` builds the equations of some frames from their unknowns and their rows of `of_frames`.
         """
         if len(x) < 3:
             return x
@@ -154,23 +163,23 @@ class MarkedBody:
             return gradient, hessian
 
         step = solve_coupled_steps(x, equations, stiffness)
-        # radians or metres that a step may go
+        # 0.5 radians or metres: longest step, so that one bad frame cannot throw the body off
         return self.retract(x, step * np.minimum(1, 0.5 / np.maximum(np.abs(step).max(axis=1, keepdims=True), 1e-12)))
 
     def step_to(self, x: np.ndarray, goal: np.ndarray) -> np.ndarray:
-        """The step (..., P) that leads from unknowns (..., P) to others."""
+        """Compute the step (..., P) that leads from unknowns x (..., P) to a goal (..., P)."""
         return step_between(x, goal, self.body.n_angles)
 
 
 def batches(count: int, size: int = BATCH) -> Iterator[slice]:
-    """So many frames, some at a time."""
+    """Yield slices of at most `size` frames that cover `count` frames."""
     return (slice(start, start + size) for start in range(0, count, size))
 
 
 def point_system(y: np.ndarray, columns: np.ndarray, targets: np.ndarray, weights: np.ndarray) -> Dense:
-    """The equations of points at y (B, 3, L), derivatives (B, P, 3, L), that are to be at targets (B, L, 3) or NaN.
+    """Build the equations of points at y (B, 3, L), with derivatives (B, P, 3, L), and targets (B, L, 3) or NaN.
 
-    `weights` (B, L) are factors on the squared distance. The derivatives are used up.
+    `weights` (B, L) are factors on the squared distance. The array of derivatives is overwritten.
     """
     (B, P), missing = columns.shape[:2], np.isnan(targets[..., 0])
     root = np.sqrt(np.where(missing, 0.0, weights))[:, None]
@@ -182,10 +191,10 @@ def point_system(y: np.ndarray, columns: np.ndarray, targets: np.ndarray, weight
 
 def marker_weights(positions: np.ndarray, targets: np.ndarray, sd: float, outlier: float
                    ) -> tuple[np.ndarray, np.ndarray]:
-    """Factors (..., L) on the squared distances of markers, 0 where nothing was seen, and which count: above a quarter.
+    """Compute Geman-McClure weights (..., L) of squared distances, and which markers count: above a quarter.
 
-    Places and targets are (..., L, 3), metres, NaN where a marker was not seen; `sd` and `outlier` as in
-    `AnimateConfig`. What is common to all markers does not make an outlier: the body may be a step behind.
+    Positions and targets are (..., L, 3), metres, NaN for a marker that was not seen: its weight is 0. `sd` and
+    `outlier` are as in `AnimateConfig`. An offset common to all markers makes no outlier: the body may be late.
     """
     squared, scale = distances_apart(positions, targets, outlier)
     share = np.where(np.isnan(squared), 0.0, (scale**2 / (scale**2 + squared))**2)
@@ -193,16 +202,16 @@ def marker_weights(positions: np.ndarray, targets: np.ndarray, sd: float, outlie
 
 
 def distances_apart(positions: np.ndarray, targets: np.ndarray, outlier: float) -> tuple[np.ndarray, np.ndarray]:
-    """Squared distances (..., L) without what is common to all, and the length (..., 1) that makes an outlier."""
+    """Compute squared distances (..., L) without the common offset, and the scale (..., 1) of an outlier, metres."""
     off = positions - targets
     off = off - median_of_known(off, -2)[..., None, :]
     squared = np.einsum("...d,...d->...", off, off)
-    # metres; a marker farther off is an outlier on however bad a fit
+    # 3 medians; at most 5 m, beyond which a marker is an outlier on any fit
     return squared, np.maximum(outlier, np.minimum(3 * np.sqrt(median_of_known(squared)), 5.0))[..., None]
 
 
 def median_of_known(values: np.ndarray, axis: int = -1) -> np.ndarray:
-    """The median of values that are not NaN, 0 without any; on few values much faster than numpy's."""
+    """Compute the median without NaN, 0 where all are NaN; on few values much faster than numpy's."""
     ordered = np.sort(values, axis=axis)                                # NaN comes last
     seen = (~np.isnan(ordered)).sum(axis=axis, keepdims=True)
     low, high = np.maximum((seen - 1) // 2, 0), np.minimum(seen // 2, values.shape[axis] - 1)
@@ -211,20 +220,20 @@ def median_of_known(values: np.ndarray, axis: int = -1) -> np.ndarray:
 
 
 def stretches(rows: np.ndarray, times: np.ndarray | None = None, apart: float = 1.0) -> list[np.ndarray]:
-    """Growing rows (n,) as stretches of which none is farther `apart` from the one before, by number or in `times`."""
+    """Split growing rows (n,) where successive ones are more than `apart` apart, by number or in `times`."""
     gaps = np.diff(rows if times is None else times[rows]) > apart
     return np.split(rows, np.flatnonzero(gaps) + 1) if len(rows) else []
 
 
 def marker_misfit(apart: np.ndarray, outlier: float) -> np.ndarray:
-    """(...) how badly markers (..., L), metres off, fit, of 0 to 1; each outlier counts the same."""
+    """Compute the misfit (...) from 0 to 1 of markers (..., L) metres off; all outliers count the same."""
     squared = apart**2
     return np.nanmean(squared / (outlier**2 + squared), axis=-1)
 
 
 def judge_markers(positions: np.ndarray, targets: np.ndarray, order: np.ndarray, outlier: float
                   ) -> tuple[np.ndarray, np.ndarray]:
-    """Residuals (..., L), metres, of the markers as they came, and which were believed under their own label."""
+    """Compute residuals (..., L), metres, of the raw markers, and which are trusted under their own label."""
     residuals = np.linalg.norm(positions - targets, axis=-1)
     squared, scale = distances_apart(positions, targets, outlier)
     return residuals, (squared < scale**2) & (order == np.arange(order.shape[-1]))
@@ -232,40 +241,42 @@ def judge_markers(positions: np.ndarray, targets: np.ndarray, order: np.ndarray,
 
 def marker_shapes(subject: Subject, vertex_ids: np.ndarray, weights: np.ndarray, distances: np.ndarray
                   ) -> PartShapes:
-    """Markers at distances (L,), metres, above the skin as local shapes; points (3L, k) are those of `supports`.
+    """Return markers at distances (L,), metres, above the skin as local shapes; points (3L, k) are those of `supports`.
 
-    The exact normal, of `energy.above_skin`, is no linear function of the body's features: over poses drawn from the
-    prior it is regressed on the rotation of the part that it follows best and the lifted twists of that part's joints.
+    The exact normal of `energy.above_skin` is not linear in the features of the body. So it is regressed, over poses
+    drawn from the prior: on the rotation of the part that it follows best, and on the twists of that part's joints.
     """
     shapes = part_shapes(subject.points(vertex_ids[::3], weights[::3]))
     if not distances.any():
         return shapes
+    # exact normals in the sampled poses, in the frame of each part; the best part is that with the least variance
     poses = _sample_poses(subject)
     supports = subject.points(vertex_ids, weights).evaluate(poses)
     normals = energy.rise_above_skin(supports, np.ones(len(distances))) - supports[:, ::3]         # (S, L, 3)
     back = np.swapaxes(shapes.skeleton.part_rotations(poses), -1, -2)
     local = (back[:, :, None] @ normals[:, None, ..., None])[..., 0]                      # (S, J, L, 3)
     part = np.argmin(local.var(axis=0).sum(axis=-1), axis=0)
+    # for each marker a linear regression on the lifted twists
     raised = shapes.lift.evaluate(twists(poses))
     offsets, bends = np.empty((len(part), 3)), []
     for i, p in enumerate(part):
         joints = [j for q, j in shapes.bends if q == p]
-        known = raised[:, joints].reshape(len(poses), -1)
-        wanted, middle = local[:, p, i], known.mean(axis=0)
-        A = known - middle
-        # the ridge holds a normal to its part where the poses say little
-        slope = np.linalg.solve(A.T @ A + 1e-2 * len(poses) * np.eye(A.shape[1]), A.T @ (wanted - wanted.mean(axis=0)))
-        offsets[i] = distances[i] * (wanted.mean(axis=0) - middle @ slope)
+        features = raised[:, joints].reshape(len(poses), -1)
+        normal, middle = local[:, p, i], features.mean(axis=0)
+        A = features - middle
+        # the ridge, 1% per sample, keeps a normal fixed to its part where the poses tell little
+        slope = np.linalg.solve(A.T @ A + 1e-2 * len(poses) * np.eye(A.shape[1]), A.T @ (normal - normal.mean(axis=0)))
+        offsets[i] = distances[i] * (normal.mean(axis=0) - middle @ slope)
         bends.append(dict(zip(joints, distances[i] * slope.reshape(len(joints), shapes.lift.width, 3), strict=True)))
     shapes.lift_off(part, offsets, bends)
     return shapes
 
 
 def _sample_poses(subject: Subject) -> np.ndarray:
-    """Poses (S, J, 3) of the prior, the root at rest."""
+    """Draw poses (S, J, 3) from the prior, with the root at rest."""
     assert subject.pose_mean is not None and subject.pose_covariance is not None, "a subject with a pose prior"
     prior = gaussian_prior(subject.pose_mean, subject.pose_covariance)
-    samples = 120  # poses from which the turning of the normals is learned
+    samples = 120  # poses for the regression of the normals
     draws = np.random.default_rng(0).standard_normal((samples, len(prior.whitening)))
     poses = np.zeros((samples, len(prior.mean)))
     poses[:, 3:] = prior.mean[3:] + np.linalg.solve(prior.whitening[:, 3:], draws.T).T
@@ -273,31 +284,33 @@ def _sample_poses(subject: Subject) -> np.ndarray:
 
 
 def supports(template: Mesh, layout: MarkerLayout) -> tuple[np.ndarray, np.ndarray]:
-    """Three points of the skin for each marker, below it and two around it that span its tangent plane.
+    """Return three points of the skin for each marker: below it, and two around it that span the tangent plane.
 
-    Vertices (3L, k), padded by repeats, and weights (3L, k), rows of which sum to 1. A marker on a triangle has its
-    plane; for one on a vertex the two are sums of the ring, by cosine and sine of the angle about the normal.
+    They are vertices (3L, k), padded by repeats, with weights (3L, k) whose rows sum to 1. A marker on a triangle uses
+    its plane. For a marker on a vertex, the two points are sums over the ring, by cosine and sine of the angle round
+    the normal.
     """
     base, weights = layout.skin
     if base.max(initial=0) >= len(template.vertices):
         raise ValueError(f"layout: expected vertices of 0..{len(template.vertices) - 1}, got {base.max()}")
     rows: list[tuple[np.ndarray, np.ndarray]] = []
-    for mine, share in zip(base, weights, strict=True):
-        if len(set(mine.tolist())) == 3:
-            rows += [(mine, share + side) for side in _sides(template, mine)]
+    for corners, share in zip(base, weights, strict=True):
+        if len(set(corners.tolist())) == 3:
+            rows += [(corners, share + side) for side in _sides(template, corners)]
             continue
-        centre = int(mine[np.argmax(share)])
+        # on a vertex: the neighbours pull by the direction in which they lie
+        centre = int(corners[np.argmax(share)])
         ring, plane = ring_around(template, centre)
         direction = plane / np.maximum(np.linalg.norm(plane, axis=1, keepdims=True), 1e-12)
-        rows.append((mine, share))
+        rows.append((corners, share))
         for axis in range(2):
             pull = direction[:, axis] / len(ring)
-            rows.append((np.concatenate([mine, ring, [centre]]), np.concatenate([share, pull, [-pull.sum()]])))
+            rows.append((np.concatenate([corners, ring, [centre]]), np.concatenate([share, pull, [-pull.sum()]])))
     return pad_combinations(rows)
 
 
 def ring_around(mesh: Mesh, centre: int) -> tuple[np.ndarray, np.ndarray]:
-    """The neighbours (n,) of a vertex, and how they lie about it in its tangent plane (n, 2), metres."""
+    """Return the neighbours (n,) of a vertex, and their coordinates (n, 2), metres, in its tangent plane."""
     adjacency, normal = mesh.vertex_adjacency, mesh.vertex_normals[centre]
     ring = adjacency.indices[adjacency.indptr[centre]:adjacency.indptr[centre + 1]]
     u = np.cross(normal, np.eye(3)[np.argmin(np.abs(normal))])
@@ -306,16 +319,16 @@ def ring_around(mesh: Mesh, centre: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def pad_combinations(rows: list[tuple[np.ndarray, np.ndarray]]) -> tuple[np.ndarray, np.ndarray]:
-    """Points as vertices and weights of different number, as two arrays (n, k), padded by repeats and zeros."""
+    """Pad points of different numbers of vertices and weights to two arrays (n, k), by repeats and zeros."""
     width = max(len(ids) for ids, _ in rows)
     return (np.array([np.pad(ids, (0, width - len(ids)), mode="edge") for ids, _ in rows]),
             np.array([np.pad(weights, (0, width - len(weights))) for _, weights in rows]))
 
 
 def _sides(template: Mesh, corners: np.ndarray) -> np.ndarray:
-    """(3, 3) what leads from the place of a marker to its three supports, as weights of the corners of its triangle.
+    """Return the offsets (3, 3) from a marker to its three supports, as weights of the corners (3,) of its triangle.
 
-    The supports turn about the outward normal, whichever way round the corners (3,) are named.
+    The supports turn about the outward normal, in whatever order the corners are given.
     """
     p = template.vertices[corners]
     outward = np.cross(p[1] - p[0], p[2] - p[0]) @ template.vertex_normals[corners].sum(axis=0) >= 0

@@ -1,11 +1,12 @@
-"""Points of a body in the fewest products, for many poses at once.
+"""Points of a body for many poses at once, with as few products as possible.
 
-A feature of a part's shape depends on the joints of that part alone, so the sum over all products of a
-feature and a rotation falls apart into one local shape a part, rotated once:
+A feature of a part's shape depends on the joints of that part only. So the sum over products of features and rotations
+becomes one local shape for each part p, rotated once:
 
     Y = Σ_p (K_p + Σ_j Σ_c f_c(t_j) B_{p,j,c}) R_pᵀ + origin + trans
 
-Where every feature moves every point, as in skinned bodies, the operator of the points itself has the fewest products.
+K_p is the constant shape, t_j the twist of joint j, f_c its lifted features, B the change of shape by each. In skinned
+bodies every feature moves every point: there the operator of the points itself needs the fewest products.
 """
 from __future__ import annotations
 
@@ -19,29 +20,30 @@ from scanprep.geometry import rotations
 
 
 class PartShapes:
-    """Points (L) of a body as local shapes of its parts; coordinates come before points, (3, L), everywhere."""
+    """Points (L) of a body as local shapes of its parts; arrays have coordinates before points, (3, L)."""
 
     def __init__(self, operator: Products) -> None:
         terms, features = operator.terms, operator.terms.features
         self.skeleton, self.lift, self.origin = terms.skeleton, features.lift, operator.origin
         J, L, m = len(terms.skeleton.parents), operator.count, features.lift.width
         self.joints, self.count = J, L
+        # K_p and B_{p,j,c}, summed over the terms of each part
         flat = operator.basis.reshape(terms.count, -1)
         of_part = terms.part == np.arange(J)[:, None]
         self.constant = ((of_part * features.constant[terms.feature]) @ flat).reshape(J, 3, L)
-        uses = np.array([features.uses[terms.feature[mine]].any(axis=0) for mine in of_part])    # (J parts, J joints)
+        uses = np.array([features.uses[terms.feature[one]].any(axis=0) for one in of_part])    # (J parts, J joints)
         mix = features.mix[:, :, terms.feature]                                                  # (J, m, M)
         self.bends = {(int(p), int(j)): ((mix[j] * of_part[p]) @ flat).reshape(m, 3, L)
                       for p, j in np.argwhere(uses)}
         self._below = terms.skeleton.descends.T.astype(float)
-        # parts of equal depth in the tree and their parents, from the root's children on
+        # parts of equal depth in the tree with their parents, for rotations level by level
         depth = terms.skeleton.descends.sum(axis=1) - 1
         levels = [np.flatnonzero(depth == d) for d in range(1, depth.max() + 1)]
         self._levels = [(children, terms.skeleton.parents[children]) for children in levels]
         self._arrange()
 
     def _arrange(self) -> None:
-        """Lay the bends out part by part and joint by joint, padded with zeros to one length."""
+        """Store the bends B by part and by joint as two arrays, padded with zeros."""
         J, L, m = self.joints, self.count, self.lift.width
         self._joint_of, by_part = _pad_lists([[j for q, j in self.bends if q == p] for p in range(J)])
         self._part_of, by_joint = _pad_lists([[p for p, q in self.bends if q == j] for j in range(J)])
@@ -53,7 +55,7 @@ class PartShapes:
             self._by_joint[j, i] = self.bends[self._part_of[j, i], j]
 
     def rotations(self, pose: np.ndarray) -> np.ndarray:
-        """World rotations (J, B, 3, 3) of the parts at poses (J, B, 3)."""
+        """Compute world rotations (J, B, 3, 3) of the parts at poses (J, B, 3)."""
         relative = rotations.exp(pose)
         R = relative.copy()
         for children, parents in self._levels:
@@ -61,27 +63,28 @@ class PartShapes:
         return R
 
     def shapes(self, t: np.ndarray) -> np.ndarray:
-        """Local shapes (J, B, 3, L) of the parts at twists (J, B, 3)."""
+        """Compute local shapes (J, B, 3, L) of the parts at twists (J, B, 3)."""
         raised = self.lift.evaluate(t.swapaxes(0, 1)).swapaxes(0, 1)                             # (J, B, m)
-        known = raised[self._joint_of].swapaxes(1, 2)                                            # (J, B, n, m)
+        features = raised[self._joint_of].swapaxes(1, 2)                                            # (J, B, n, m)
         J, B = t.shape[:2]
-        bent = known.reshape(J, B, -1) @ self._by_part.reshape(J, -1, 3 * self.count)
+        bent = features.reshape(J, B, -1) @ self._by_part.reshape(J, -1, 3 * self.count)
         return self.constant[:, None] + bent.reshape(J, B, 3, -1)
 
     def evaluate(self, pose: np.ndarray, trans: np.ndarray) -> np.ndarray:
-        """Places (B, 3, L), metres, at poses (B, J, 3) and trans (B, 3)."""
+        """Compute points (B, 3, L), metres, at poses (B, J, 3) and trans (B, 3)."""
         t = twists(pose).swapaxes(0, 1)
         carried = self.rotations(t) @ self.shapes(t)
         return carried.sum(axis=0) + (self.origin + trans)[:, :, None]
 
     def columns(self, pose: np.ndarray, trans: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Places (B, 3, L), metres, at poses (B, J, 3), and their derivatives (B, 3J + 3, 3, L) as of `MarkedBody`."""
+        """Compute points (B, 3, L), metres, and derivatives (B, 3J + 3, 3, L), as in `MarkedBody`."""
         t = twists(pose).swapaxes(0, 1)
         (J, B), L = t.shape[:2], self.count
         R = self.rotations(t)
         below = (self._below @ (R @ self.shapes(t)).reshape(J, -1)).reshape(J, B, 3, L)
         # a rotation about the column ω of R moves x by ω × x = hat(ω) @ x
         columns = rotations.hat(np.swapaxes(R, -1, -2)).reshape(J, B, 9, 3) @ below
+        # a turn also changes the twist of its joint, which bends the shapes of the parts beside it
         slope = self.lift.derivative(t.swapaxes(0, 1)).swapaxes(0, 1) @ rotations.inverse_right_jacobian(t)
         rotated = R[self._part_of].swapaxes(1, 2)                                                # (J, B, n, 3, 3)
         along = slope.swapaxes(-1, -2)[:, :, :, None, None, :, None] \
@@ -93,7 +96,7 @@ class PartShapes:
         return below[0] + (self.origin + trans)[:, :, None], out
 
     def lift_off(self, part: np.ndarray, offsets: np.ndarray, bends: list[dict[int, np.ndarray]]) -> None:
-        """Add to every point a vector (L, 3), metres, that turns with a part (L,), and (m, 3) by its joints."""
+        """Add to every point a vector (L, 3), metres, fixed to a part (L,), and changes (m, 3) by its joints."""
         for i, p in enumerate(part):
             self.constant[p, :, i] += offsets[i]
             for j, bend in bends[i].items():
@@ -102,9 +105,10 @@ class PartShapes:
 
 
 class SkinnedShapes(PartShapes):
-    """Points (L) of a skinned body: its operator moves them, and what lifts them off the skin is shapes of parts."""
+    """Points (L) of a skinned body: its operator moves them, and part shapes lift them off the skin."""
 
     def __init__(self, operator: Blended) -> None:
+        # empty shapes for all parts and joints, filled by `lift_off`
         of_part, L = operator.skeleton.joints_of_part, operator.count
         part = np.repeat(np.arange(len(of_part)), [len(joints) for joints in of_part])
         features = operator.features
@@ -139,7 +143,7 @@ class SkinnedShapes(PartShapes):
 
 
 def part_shapes(operator: PointOperator) -> PartShapes:
-    """The points of an operator for the inner loop."""
+    """Return the points of an operator in the form for the inner loop."""
     if isinstance(operator, Products):
         return PartShapes(operator)
     assert isinstance(operator, Blended), "one of the two kinds of operators"
@@ -147,7 +151,7 @@ def part_shapes(operator: PointOperator) -> PartShapes:
 
 
 def _pad_lists(lists: list[list[int]]) -> tuple[np.ndarray, np.ndarray]:
-    """Lists of different lengths as rows (n, width), and which entries are real."""
+    """Pad lists of different lengths to rows (n, width), and return a mask of the real entries."""
     width = max(1, max(len(row) for row in lists))
     return (np.array([row + [0] * (width - len(row)) for row in lists]),
             np.array([[i < len(row) for i in range(width)] for row in lists]))

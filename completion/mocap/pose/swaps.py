@@ -1,7 +1,7 @@
-"""Which labels were swapped when: pairs decided over the whole sequence, or frame by frame in a stream.
+"""Swapped markers: which labels were swapped when, decided over the whole sequence, or frame by frame in a stream.
 
-A track tells from one frame to the next which label goes on where another was; no body is needed for that. Where the
-body has the markers tells which label belongs to a stretch of track.
+Two sources of evidence. Tracks tell from frame to frame which label continues where another was; no body is needed.
+The simulated markers of a body tell which label belongs to a stretch of track.
 """
 from __future__ import annotations
 
@@ -12,27 +12,30 @@ from scipy.ndimage import median_filter
 
 from .marked_body import AnimateConfig, distances_apart, median_of_known
 
-TORN = 10.0                          # most that a torn track counts, in half squared standard deviations
-AWAY = 8.0                           # most that a marker away from its place counts, in half squared deviations
-CHANGE = 4.0                         # what each change of a label must be worth, likewise
+# Costs are half squared standard deviations, that is negative log-likelihoods.
+TORN = 10.0                          # largest cost of a jump in a track
+AWAY = 8.0                           # largest cost of a marker far from its place on the body
+CHANGE = 4.0                         # cost of each change of a label
 WORTH = 2.0                          # least gain for which labels are swapped
-DEVIATION = 0.008                    # metres from its usual place on the body that a marker lies, in each direction
-MEMORY = 0.1                         # seconds that this distance stays much the same
-ENTER, LEAVE = 0.5, 1.0              # share of the distance left when labels of a stream are swapped, and put back
-AT_ONCE = 64                         # frames whose levels of all pairs are held
+DEVIATION = 0.008                    # metres: standard deviation of a marker from its place, in each direction
+MEMORY = 0.1                         # seconds over which that deviation hardly changes, so its frames count as one
+# Hysteresis in a stream: labels are swapped when at most ENTER of the distance is left, and swapped back below LEAVE.
+ENTER, LEAVE = 0.5, 1.0
+AT_ONCE = 64                         # frames whose costs of all pairs are in memory
 
 
 class Tracks:
     """Tracks (T, L, 3) of labels, metres, NaN where one was not seen.
 
-    From one frame to the next a track moves at the mean of its velocities before and after, which misses no more
-    than a change of acceleration: it is `off` (T, L) metres, usually `sd`, NaN where it is not seen in both. It
-    `jumped` (T, L), or is `open`: not known to go on. A label that takes over another's track goes on from its place.
+    From frame to frame a track is predicted by the mean of its velocities before and after, which is exact for constant
+    acceleration. The miss is `off` (T, L), metres, NaN where the label is not seen in both frames; its usual size is
+    `sd`. A track has `jumped` (T, L) where it misses by far more, and is `open` where it is not known to go on.
     """
 
     def __init__(self, positions: np.ndarray, rate: float) -> None:
-        least_jump, jump_sds = 0.006, 5.0                               # metres, and standard deviations
+        least_jump, jump_sds = 0.006, 5.0                               # a jump: at least 6 mm and 5 usual misses
         self.positions, self.rate = positions, rate
+        # velocities before and after each frame, and the last frame in which each label was seen
         steps = np.diff(positions, axis=0)
         missing = np.full((1, *positions.shape[1:]), np.nan)
         self._after = np.concatenate([_median_of_next(steps), missing])
@@ -46,28 +49,29 @@ class Tracks:
         self.jumped = np.nan_to_num(self.off) > np.maximum(least_jump, jump_sds * self.sd)
 
     def change(self, columns: np.ndarray, positions: np.ndarray) -> None:
-        """Have other positions (T, n, 3) in some columns (n,)."""
+        """Replace the positions (T, n, 3) of some columns (n,)."""
         other = Tracks(positions, self.rate)
         self.positions = self.positions.copy()
         for name in ("positions", "_after", "_before", "_last", "off", "sd", "open", "jumped"):
             getattr(self, name)[:, columns] = getattr(other, name)
 
     def _usual(self) -> np.ndarray:
-        """The usual size (T, L) of what is off: within 12 frames of that time, and no less than over all of it."""
-        floor, sds_to_median = 0.002, 1.5                               # metres; of a distance, nearly
+        """Compute the usual miss (T, L): the median within 12 frames, and no less than over the whole sequence."""
+        floor, sds_to_median = 0.002, 1.5                               # metres; median of a distance to its sd, nearly
         near = median_filter(np.nan_to_num(self.off), size=(25, 1), mode="nearest")
         whole = [np.median(x[np.isfinite(x)]) if np.isfinite(x).any() else 0.0 for x in self.off.T]
         return np.maximum(floor, sds_to_median * np.maximum(near, whole))
 
     def links(self, times: np.ndarray, before: np.ndarray, after: np.ndarray) -> np.ndarray:
-        """What it counts that labels `after` go on, in frames `times`, where labels `before` were until then.
+        """Compute the cost that labels `after` continue, in frames `times`, the tracks of labels `before`.
 
-        Half squared standard deviations, at most `TORN`, as for a label that appears; nothing where no label `after` is
-        seen. Over a gap a track may have taken another way. The three are arrays of one shape, after broadcasting.
+        The cost is at most `TORN`, which a label that appears has too, and 0 where the label `after` is not seen. In a
+        gap the track may have accelerated. The three arguments are arrays that broadcast to one shape.
         """
-        acceleration, longest = 10.0, 0.25          # m/s² out of sight; seconds of a gap beyond which nothing is told
+        acceleration, longest = 10.0, 0.25          # m/s² within a gap; seconds, longer gaps tell nothing
         last = self._last[times - 1, before]
         gap = times - last
+        # the miss at the end of the gap, and its standard deviation, which grows with the gap
         way = gap[..., None] * _mean_of_known(self._before[last, before], self._after[times, after])
         off = np.linalg.norm(self.positions[times, after] - self.positions[last, before] - way, axis=-1)
         usual = np.maximum(self.sd[last, before], self.sd[times, after])
@@ -77,37 +81,37 @@ class Tracks:
         return np.where(np.isnan(self.positions[times, after, 0]), 0.0, cost)
 
     def loose_ends(self, a: int, b: int) -> np.ndarray:
-        """Frames (n,), the first among them, from which on a pair may be swapped: neither track goes on there."""
+        """Return frames (n,), the first included, at which a pair may be swapped: neither track continues there."""
         free = self.jumped[:, [a, b]] | self.open[:, [a, b]]
         loose = free.all(axis=1)
-        loose &= ~(self.open[:, a] & self.open[:, b] & np.append(loose[1:], False))        # of a gap its end alone
+        loose &= ~(self.open[:, a] & self.open[:, b] & np.append(loose[1:], False))        # of a gap only its end
         loose[0] = True
         return np.flatnonzero(loose)
 
 
 def _median_of_next(steps: np.ndarray) -> np.ndarray:
-    """The median (T - 1, L, 3) of this and the next two steps, or one of those that are known; NaN without any."""
+    """Compute the median (T - 1, L, 3) of three successive steps, or of the known ones; NaN without any."""
     padded = np.concatenate([steps, np.full((2, *steps.shape[1:]), np.nan)])
     a, b, c = (padded[i:len(steps) + i] for i in range(3))
     return np.fmax(np.fmin(a, b), np.fmin(np.fmax(a, b), c))
 
 
 def _mean_of_known(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """The mean of two velocities, or the one that is known, or zero."""
+    """Compute the mean of two velocities, or the known one, or zero."""
     known = np.isfinite(a[..., :1]).astype(int) + np.isfinite(b[..., :1])
     return (np.nan_to_num(a) + np.nan_to_num(b)) / np.maximum(known, 1)
 
 
 def apply_order(positions: np.ndarray, order: np.ndarray) -> np.ndarray:
-    """Markers (T, L, 3) under the labels that an order (T, L) gives them."""
+    """Return markers (T, L, 3) under the labels that an order (T, L) gives them."""
     return np.take_along_axis(positions, order[..., None], axis=1)
 
 
 @dataclass(frozen=True, eq=False)
 class Seats:
-    """Where the body has the markers: places (T, L, 3), metres, NaN where unknown, then nowhere near.
+    """Places (T, L, 3) of the markers on the body, metres, NaN where unknown, which counts as far away.
 
-    A marker lies off them by a standard `deviation` (T,), metres, in each direction; a level counts `share` times.
+    A marker is off by a standard `deviation` (T,), metres, in each direction; costs are multiplied by `share`.
     """
 
     places: np.ndarray
@@ -115,17 +119,17 @@ class Seats:
     share: float
 
     def levels(self, frames: slice, rows: np.ndarray, positions: np.ndarray) -> np.ndarray:
-        """What it counts (n, R, C) that labels at positions (n, C, 3) are the markers of rows: see `marker_levels`."""
+        """Compute costs (n, R, C) that labels at positions (n, C, 3) are the markers of rows: see `marker_levels`."""
         return self.share * marker_levels(self.places[frames, rows, None], positions[:, None],
                                           self.deviation[frames, None, None])
 
     def own(self, positions: np.ndarray, rows: slice | list[int] = slice(None)) -> np.ndarray:
-        """What it counts (T, R) that labels at positions (T, R, 3) are the markers of some rows, one each."""
+        """Compute costs (T, R) that labels at positions (T, R, 3) are the markers of some rows, one each."""
         return self.share * marker_levels(self.places[:, rows], positions, self.deviation[:, None])
 
 
 def marker_levels(places: np.ndarray, positions: np.ndarray, deviation: np.ndarray) -> np.ndarray:
-    """What it counts (...) that a label is a marker: half squared deviations, at most `AWAY`; places (..., 3)."""
+    """Compute the cost (...) that a label is a marker with places (..., 3): at most `AWAY`, 0 where not seen."""
     squared = sum((places[..., d] - positions[..., d])**2 for d in range(3))
     cost = np.minimum(np.nan_to_num(squared / (2 * deviation**2), nan=AWAY), AWAY)
     return np.asarray(cost * np.isfinite(positions[..., 0]))
@@ -133,20 +137,21 @@ def marker_levels(places: np.ndarray, positions: np.ndarray, deviation: np.ndarr
 
 def find_order(positions: np.ndarray, rate: float, places: np.ndarray | None = None,
                deviation: float | np.ndarray = DEVIATION) -> np.ndarray:
-    """Which column (T, L) each marker is to be taken from, by its track and by places (T, L, 3) on a body, if any.
+    """Find the column (T, L) of each marker, by its track and by places (T, L, 3) on a body, if any.
 
-    A marker lies off its place by a standard `deviation`, metres, one for all or for each frame. The frames of
-    `MEMORY` count as one. The best pair and span is swapped, then the best of what is left, until nothing gains: of a
-    longer cycle each swap puts one marker right.
+    A marker is off its place by a standard `deviation`, metres, one for all or for each frame. The frames of `MEMORY`
+    count as one. The best pair and span is swapped, then the best of the rest, until nothing gains. In a longer cycle
+    each swap corrects one marker.
     """
     T, L = positions.shape[:2]
     order, tracks = np.tile(np.arange(L), (T, 1)), Tracks(positions, rate)
     seats = None if places is None else Seats(places, np.broadcast_to(deviation, T), min(1.0, 1 / (MEMORY * rate)))
     touched = set(range(L))
-    for _ in range(12):                                                 # longer cycles come apart into pairs
-        found = _best_spans(tracks, seats, touched)
+    for _ in range(12):                                                 # rounds: longer cycles need several swaps
+        candidates = _best_spans(tracks, seats, touched)
         touched = set()
-        for _, a, b, swapped in sorted(found, key=lambda f: -f[0]):
+        # swap the best pairs that share no label, then update their tracks
+        for _, a, b, swapped in sorted(candidates, key=lambda f: -f[0]):
             if not touched & {a, b}:
                 two = np.array([a, b])
                 order[np.ix_(swapped, two)] = order[np.ix_(swapped, two[::-1])]
@@ -159,7 +164,7 @@ def find_order(positions: np.ndarray, rate: float, places: np.ndarray | None = N
 
 
 def _best_spans(tracks: Tracks, seats: Seats | None, touched: set[int]) -> list[tuple[float, int, int, np.ndarray]]:
-    """Gain, pair and frames (n,) of all pairs with a label of `touched` that gain by being swapped."""
+    """Return gain, pair and frames (n,) of all pairs with a label of `touched` that gain by a swap."""
     pairs, at = pairs_that_jump(tracks, touched), tracks.positions
     own = np.zeros(at.shape[:2]) if seats is None else seats.own(at)
     if seats is not None:
@@ -175,9 +180,9 @@ def _best_spans(tracks: Tracks, seats: Seats | None, touched: set[int]) -> list[
 
 
 def best_stretches(tracks: Tracks, a: int, b: int, begins: np.ndarray, gains: np.ndarray) -> tuple[float, np.ndarray]:
-    """What it gains to swap a pair in some of the stretches that begin at frames (m,), and in which frames (n,)."""
+    """Find the stretches, beginning at frames (m,), in which to swap a pair; return the gain and frames (n,)."""
     lengths = np.diff(np.r_[begins, len(tracks.positions)])
-    minority = 2.0                                  # changes that swapping the labels of the whole sequence counts
+    minority = 2.0                                  # a swap of the whole sequence costs as much as 2 changes
     gains = gains - minority * CHANGE * lengths / lengths.sum()
     stay, switch = (tracks.links(begins[1:], np.array([[a], [b]]), np.array(after)).sum(axis=0)
                     for after in ([[a], [b]], [[b], [a]]))
@@ -186,21 +191,21 @@ def best_stretches(tracks: Tracks, a: int, b: int, begins: np.ndarray, gains: np
 
 
 def pairs_that_jump(tracks: Tracks, touched: set[int]) -> set[tuple[int, int]]:
-    """Pairs with a label of `touched` that once go on where the other was, better than where they were themselves."""
+    """Return pairs with a label of `touched` whose tracks once continue each other better than themselves."""
     pairs: set[tuple[int, int]] = set()
     free = tracks.jumped | tracks.open
     for t in np.flatnonzero(tracks.jumped[:, sorted(touched)].any(axis=1)):
-        some = np.flatnonzero(free[t])
-        cost = tracks.links(np.full((1, 1), t), some[:, None], some[None])
+        candidates = np.flatnonzero(free[t])
+        cost = tracks.links(np.full((1, 1), t), candidates[:, None], candidates[None])
         stay = np.diag(cost)
         better = cost + cost.T < stay[:, None] + stay - 1
-        better &= tracks.jumped[t, some][:, None] | tracks.jumped[t, some]
-        pairs |= {(int(some[i]), int(some[j])) for i, j in np.argwhere(np.triu(better, 1))}
+        better &= tracks.jumped[t, candidates][:, None] | tracks.jumped[t, candidates]
+        pairs |= {(int(candidates[i]), int(candidates[j])) for i, j in np.argwhere(np.triu(better, 1))}
     return {pair for pair in pairs if touched & set(pair)}
 
 
 def _pairs_that_fit(seats: Seats, positions: np.ndarray, own: np.ndarray, rows: np.ndarray) -> set[tuple[int, int]]:
-    """Pairs with a label of some rows that over some stretch lie where the body has the other one."""
+    """Return pairs with a label of some rows that over a stretch lie at each other's place on the body."""
     T, L = own.shape
     total, least, best = (np.zeros((1, len(rows), L)) for _ in range(3))   # up to here; the least so far; most since
     for start in range(0, T, AT_ONCE):
@@ -208,6 +213,7 @@ def _pairs_that_fit(seats: Seats, positions: np.ndarray, own: np.ndarray, rows: 
         there = seats.levels(some, rows, positions[some])
         back = there if len(rows) == L else seats.levels(some, np.arange(L), positions[some][:, rows])
         gain = own[some][:, rows, None] + own[some][:, None] - there - np.swapaxes(back, 1, 2)
+        # best gain over any stretch: the largest rise of the running sum above its minimum so far
         run = np.cumsum(np.concatenate([total, gain]), axis=0)
         low = np.minimum.accumulate(np.concatenate([least, run[1:]]), axis=0)
         best = np.maximum(best, (run - low).max(axis=0))
@@ -218,15 +224,16 @@ def _pairs_that_fit(seats: Seats, positions: np.ndarray, own: np.ndarray, rows: 
 
 
 def _two_states(gains: np.ndarray, stay: np.ndarray, switch: np.ndarray) -> tuple[float, np.ndarray]:
-    """The best way through stretches (n + 1) of a pair as labelled or swapped: what it gains, and where (n + 1).
+    """Find the best sequence of states (n + 1), as labelled or swapped, and its gain, by the Viterbi algorithm.
 
-    `gains` (n + 1,) are of being swapped in a stretch; `stay`, `switch` (n,) what remaining and changing cost.
+    `gains` (n + 1,) are those of a swapped stretch; `stay` and `switch` (n,) are costs between stretches.
     """
     value, came = np.array([0.0, gains[0]]), np.zeros((len(stay), 2), dtype=int)
     for i, (remain, change) in enumerate(zip(stay, switch, strict=True)):
         onward = np.stack([value - remain, value[::-1] - change - CHANGE])
         came[i] = onward.argmax(axis=0)
         value = onward.max(axis=0) + [0.0, gains[i + 1]]
+    # trace the states back from the better end
     state = int(value.argmax())
     gained = float(value[state] + stay.sum())
     states = [state]
@@ -237,21 +244,21 @@ def _two_states(gains: np.ndarray, stay: np.ndarray, switch: np.ndarray) -> tupl
 
 
 def label_order(positions: np.ndarray, targets: np.ndarray, rate: float, outlier: float) -> np.ndarray:
-    """Which column (T, L) each marker is taken from, the body having them at places (T, L, 3), by `find_order`."""
+    """Find the column (T, L) of each marker by `find_order`, with simulated markers (T, L, 3) on a body."""
     squared, scale = distances_apart(positions, targets, outlier)
-    if ((squared > (0.5 * scale)**2).sum(axis=1) < 2).all():            # nothing is far off, or everything is believed
+    if ((squared > (0.5 * scale)**2).sum(axis=1) < 2).all():            # a swap puts at least two markers far off
         return np.tile(np.arange(targets.shape[1]), (len(targets), 1))
     shift = median_of_known(positions - targets, -2)[..., None, :]
-    # on a body that fits badly a marker is as much farther from its place as one must be to be an outlier
+    # on a body that fits badly the deviation grows like the scale of outliers
     deviation = DEVIATION * scale[..., 0] / AnimateConfig.outlier
     return find_order(targets, rate, positions - shift, deviation)
 
 
 class LabelWatch:
-    """Pairs of markers, of so many, that have swapped their labels, told frame by frame for streams.
+    """Swapped pairs among `count` markers, found frame by frame in streams.
 
-    A pair is swapped when that removes most of the distance of both from where the body would put them, and put back
-    when the labels as they came fit better again. No scores of `find_order`: a body that has leapt is far from all.
+    A pair is swapped when that removes most of the distance of both from their simulated places. It is swapped back
+    when the original labels fit better again. The costs of `find_order` would not do: after a jump all are large.
     """
 
     def __init__(self, count: int, outlier: float) -> None:
@@ -259,19 +266,20 @@ class LabelWatch:
         self.order = np.arange(count)
 
     def update(self, positions: np.ndarray, targets: np.ndarray) -> np.ndarray:
-        """Which column (L,) each marker is taken from, for places on the body and markers as they came (L, 3)."""
+        """Return the column (L,) of each marker, for simulated and measured markers (L, 3)."""
         taken = targets[self.order]
         squared, scale = distances_apart(positions, taken, self.outlier)
-        suspect = squared > (0.5 * scale)**2                            # never of NaN
+        suspect = squared > (0.5 * scale)**2                            # false for NaN
         changed = self.order != np.arange(len(self.order))
         if suspect.sum() < 2 and not changed.any():
             return self.order
         shift = median_of_known(positions - taken, 0)
-        some = np.flatnonzero((suspect | changed) & ~np.isnan(squared))
-        apart = np.linalg.norm(positions[some, None] - shift - taken[some], axis=2)
-        for i, j in zip(*np.triu_indices(len(some), 1), strict=True):
+        candidates = np.flatnonzero((suspect | changed) & ~np.isnan(squared))
+        apart = np.linalg.norm(positions[candidates, None] - shift - taken[candidates], axis=2)
+        # swap a pair if that leaves much less distance
+        for i, j in zip(*np.triu_indices(len(candidates), 1), strict=True):
             now, then = apart[i, i] + apart[j, j], apart[i, j] + apart[j, i]
-            a, b = some[i], some[j]
+            a, b = candidates[i], candidates[j]
             back = self.order[a] == b
             if then < (LEAVE if back else ENTER) * now and (back or max(apart[i, j], apart[j, i]) < 0.5 * scale[0]):
                 self.order[[a, b]] = self.order[[b, a]]

@@ -1,4 +1,4 @@
-"""A motion on another body, and on a body that changes while it moves."""
+"""Retarget a motion to another body, or to a body whose shape changes while it moves."""
 from __future__ import annotations
 
 from collections.abc import Mapping
@@ -13,37 +13,56 @@ from scanprep.pictures.camera import guess_upright
 
 from ...motion import Motion
 
-AT_ONCE = 256                        # frames whose meshes are held at a time
+AT_ONCE = 256                        # frames whose meshes are in memory at once
 
 
 def retarget(motion: Motion, source: Subject, target: Subject) -> Motion:
-    """The motion on another person, whose feet reach the ground when those of the first do.
+    """Retarget a motion to another person, whose feet reach the ground when those of the first do.
 
-    Joints turn as they did. The way over the ground is as long as the legs are: from the place of the first frame it
-    is scaled by the ratio of how high the root stands at rest. Up and down, the lowest point of the target is
-    as high above the floor, in the same ratio, as that of the source; the floor is where the source's lowest point
-    mostly is when it is low. Residuals of markers are left out: they were another person's.
+    Joint rotations stay. The path over the ground is scaled by the ratio of the heights of the roots at rest, from the
+    place of the first frame. The height is chosen so that the lowest point of the target is as far above the floor, in
+    the same ratio, as that of the source. The floor is where the lowest point of the source is when it is low.
+    Residuals of markers are removed: they were another person's.
 
     Parameters
     ----------
     motion : Motion
+        Of the source.
     source, target : Subject
         Of the same model.
+
+    Returns
+    -------
+    Motion
+        The same poses (T, J, 3), new trans (T, 3) in metres, without markers.
 
     Raises
     ------
     ValueError
-        Bodies of different parts.
+        Bodies with different parts.
+
+    Examples
+    --------
+    >>> from model import load_built_in_model
+    >>> model = load_built_in_model()
+    >>> still = Motion(np.zeros((4, 16, 3)), np.zeros((4, 3)), None, 120.0, np.zeros((4, 0)))
+    >>> tall = retarget(still, model.subject(), model.subject(np.array([2.0])))
+    >>> tall.trans.shape, tall.betas.shape
+    ((4, 3), (1,))
+
+    [SCAPE] §8
     """
     J = len(source.skeleton.parents)
     if len(target.skeleton.parents) != J or motion.poses.shape[1] != J:
         raise ValueError(f"target: expected a body of the {J} parts that move, got {len(target.skeleton.parents)}")
+    # scale the path over the ground
     up, sign = world_up(motion, source)
     ratio = _stands(target) / _stands(source)
     trans = motion.trans[0] + ratio * (motion.trans - motion.trans[0])
     trans[:, up] = motion.trans[:, up]
+    # keep the lowest point at the same relative height above the floor
     low = lowest_heights(source, motion.poses, motion.trans, up, sign)
-    floor = np.percentile(low, 2.0)                                  # where the lowest points are when they are low
+    floor = np.percentile(low, 2.0)                                  # 2%: robust against single low frames
     trans[:, up] += sign * (floor + ratio * (low - floor) - lowest_heights(target, motion.poses, trans, up, sign))
     none = np.zeros((len(motion.poses), 0))
     return replace(motion, trans=trans, betas=target.betas, residuals=none, labels=(), trusted=none.astype(bool))
@@ -51,20 +70,20 @@ def retarget(motion: Motion, source: Subject, target: Subject) -> Motion:
 
 def morph_vertices(model: BodyModel, motion: Motion, betas: np.ndarray | Mapping[float, np.ndarray],
                    frames: np.ndarray | slice = slice(None), grounded: bool = True) -> np.ndarray:
-    """The meshes (n, N, 3), metres, of a motion while the body changes.
+    """Compute the meshes (n, N, 3), metres, of a motion while the shape of the body changes.
 
-    Vertices are affine in betas, so a change along a line needs no more than two bodies. Few frames of a body that
-    changes in many ways are made one by one.
+    Vertices are affine in betas, so a change along a line needs two bodies only. A few frames of a body that changes in
+    many directions are computed one by one.
 
     Parameters
     ----------
     model : BodyModel
     motion : Motion
     betas : (T, k) float, or {seconds: (k,) float}
-        For every frame, or at some times and straight between them.
+        For every frame, or at some times, with linear interpolation.
     frames : indices or slice, optional
     grounded : bool
-        Move each frame up or down so that the lowest point is as high as that of the motion's own body.
+        Move each frame vertically so that its lowest point is as high as that of the motion's own body.
 
     Raises
     ------
@@ -78,10 +97,11 @@ def morph_vertices(model: BodyModel, motion: Motion, betas: np.ndarray | Mapping
         raise ValueError(f"betas: expected ({len(motion.poses)}, k) with k at most {model.n_betas}, got {betas.shape}")
     poses, trans, betas = motion.poses[frames], motion.trans[frames], betas[frames]
     middle = betas.mean(axis=0)
+    # the directions in which the betas change
     U, size, directions = np.linalg.svd(betas - middle, full_matrices=False)
-    some = size > 1e-6 * max(size.max(initial=0), 1.0)
-    shares, steps = U[:, some] * size[some], directions[some]
-    if len(poses) < 20 * len(steps):                  # making a body costs as much as the meshes of 20 frames
+    used = size > 1e-6 * max(size.max(initial=0), 1.0)
+    shares, steps = U[:, used] * size[used], directions[used]
+    if len(poses) < 20 * len(steps):                  # one body costs as much as the meshes of 20 frames
         out = model.vertices(poses, betas, trans)
     else:
         first = model.subject(middle)
@@ -97,7 +117,7 @@ def morph_vertices(model: BodyModel, motion: Motion, betas: np.ndarray | Mapping
 
 
 def betas_over_time(betas: np.ndarray | Mapping[float, np.ndarray], times: np.ndarray) -> np.ndarray:
-    """(T, k) betas at times (T,) seconds, straight between keys and held before the first and after the last."""
+    """Interpolate betas (T, k) linearly at times (T,) seconds, constant before the first and after the last key."""
     if not isinstance(betas, Mapping):
         return np.asarray(betas, dtype=np.float64)
     if not betas:
@@ -109,7 +129,7 @@ def betas_over_time(betas: np.ndarray | Mapping[float, np.ndarray], times: np.nd
 
 
 def world_up(motion: Motion, subject: Subject) -> tuple[int, float]:
-    """The axis of the world that is up in a motion, and which way: where the body's own up points on average."""
+    """Return the world axis that is up in a motion, and its sign: where the body's up axis points on average."""
     body_up = np.eye(3)[guess_upright(subject.template)[0]]
     mean = (rotations.exp(motion.poses[:, 0]) @ body_up).mean(axis=0)
     axis = int(np.abs(mean).argmax())
@@ -117,14 +137,14 @@ def world_up(motion: Motion, subject: Subject) -> tuple[int, float]:
 
 
 def lowest_heights(subject: Subject, poses: np.ndarray, trans: np.ndarray, up: int, sign: float) -> np.ndarray:
-    """(T,) metres: the height of the lowest point of every frame."""
+    """Compute the height (T,), metres, of the lowest point of every frame."""
     return np.concatenate([
         (sign * subject.vertices(poses[i:i + AT_ONCE], trans[i:i + AT_ONCE])[:, :, up]).min(axis=1)
         for i in range(0, len(poses), AT_ONCE)]) if len(poses) else np.zeros(0)
 
 
 def _stands(subject: Subject) -> float:
-    """How high the root's centroid stands above the lowest point at rest, metres."""
+    """Compute the height of the root's centroid above the lowest point at rest, metres."""
     up = guess_upright(subject.template)[0]
     rest = subject.vertices(np.zeros((len(subject.skeleton.parents), 3)))
     return float(subject.origin[up] - rest[:, up].min())

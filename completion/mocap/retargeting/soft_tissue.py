@@ -1,4 +1,4 @@
-"""Pose and soft tissue of a person on a character [MoSh]: motion, pictures, and creases laid smooth."""
+"""Retarget pose and soft tissue of a person to a character [MoSh]: motion, pictures, smoothed creases."""
 from __future__ import annotations
 
 from dataclasses import replace
@@ -25,10 +25,10 @@ from .retarget import AT_ONCE, retarget, world_up
 
 
 def retarget_soft_tissue(soft: SoftTissue, model: BodyModel, character: BodyModel, factor: float = 1.0) -> SoftTissue:
-    """The motion and the soft tissue of a person on a character.
+    """Retarget motion and soft tissue of a person to a character.
 
-    Joints turn as they did, and the skin moves as far as it did, on the character instead of the person. The way over
-    the ground is as long as the character's legs are, and it reaches the ground when the person does (see `retarget`).
+    Joint rotations and displacements of the skin stay the same. The path over the ground is scaled to the character's
+    legs, and the character reaches the ground when the person does (see `retarget`).
 
     Parameters
     ----------
@@ -37,14 +37,14 @@ def retarget_soft_tissue(soft: SoftTissue, model: BodyModel, character: BodyMode
     model : BodyModel
         The person's.
     character : BodyModel
-        The same with a character as its mean (`character_model`).
+        The same model with a character as its mean (`character_model`).
     factor : float
-        How many times the soft tissue is taken: more than 1 exaggerates it, 0 leaves it out.
+        Factor on the soft tissue: more than 1 exaggerates it, 0 leaves it out.
 
     Returns
     -------
     SoftTissue
-        Of the character model: the character's own betas are zero, the factor is in the soft tissue.
+        Of the character model, with zero betas; the factor is in the soft tissue.
 
     Raises
     ------
@@ -60,11 +60,12 @@ def retarget_soft_tissue(soft: SoftTissue, model: BodyModel, character: BodyMode
     motion = retarget(soft.motion, model.subject(soft.motion.betas), target)
     moving = replace(soft.times(factor), motion=motion)
     up, sign = world_up(motion, target)
-    # the soles: at most 60 vertices that are the lowest of some frame
+    # the soles: the 60 vertices that are the lowest in most frames
     lowest = [np.argmin(sign * target.vertices(motion.poses[i:i + AT_ONCE])[:, :, up], axis=1)
               for i in range(0, len(motion.poses), AT_ONCE)]
     ids, often = np.unique(np.concatenate(lowest), return_counts=True)
     soles = np.sort(ids[np.argsort(-often, kind="stable")[:60]])
+    # lift every frame so that soft tissue of the soles does not change their height
     trans = motion.trans.copy()
     fixed, changed = (sign * each.points(character, soles[:, None], np.ones((len(soles), 1)))[..., up]
                       for each in (moving.times(0.0), moving))
@@ -73,10 +74,10 @@ def retarget_soft_tissue(soft: SoftTissue, model: BodyModel, character: BodyMode
 
 
 def deformation(faces: np.ndarray, fixed: np.ndarray, changed: np.ndarray) -> np.ndarray:
-    """How far the skin is stretched or squeezed against the same pose without soft tissue.
+    """Compute how far soft tissue stretches or squeezes the skin in each pose.
 
-    Of every triangle the larger of its two stretches, as a share of its length; a vertex has the mean of its
-    triangles by area.
+    For each triangle it is the larger of the two principal stretches minus 1. A vertex has the mean of its triangles,
+    weighted by area.
 
     Parameters
     ----------
@@ -90,7 +91,7 @@ def deformation(faces: np.ndarray, fixed: np.ndarray, changed: np.ndarray) -> np
 
     [MoSh]
     """
-    # the products of the two edges of every triangle: first with itself, with the second, second itself
+    # first fundamental forms: products of the two edges e, f of every triangle, e·e, e·f, f·f
     products = []
     for vertices in (fixed, changed):
         e, f = (vertices[..., faces[:, k], :] - vertices[..., faces[:, 0], :] for k in (1, 2))
@@ -98,10 +99,12 @@ def deformation(faces: np.ndarray, fixed: np.ndarray, changed: np.ndarray) -> np
     (a, b, c), (p, q, r) = products
     area = a * c - b * b
     safe = np.maximum(area, np.finfo(float).tiny)
+    # squared stretches are the eigenvalues of the deformed form relative to the fixed one: half ± apart
     half, whole = (p * c - 2 * q * b + r * a) / safe / 2, (p * r - q * q) / safe
     apart = np.sqrt(np.maximum(half**2 - whole, 0))
     stretches = np.sqrt(np.maximum([half - apart, half + apart], 0))
     strain = np.abs(stretches - 1).max(axis=0)
+    # means of the triangles at each vertex
     weight = np.sqrt(np.maximum(area, 0))
     corners = csr_array((np.ones(faces.size), faces.ravel(), 3 * np.arange(len(faces) + 1)),
                         shape=(len(faces), fixed.shape[-2]))
@@ -110,16 +113,16 @@ def deformation(faces: np.ndarray, fixed: np.ndarray, changed: np.ndarray) -> np
 
 
 def moving_character(character: BodyModel, soft: SoftTissue, frames: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The meshes (n, N, 3), metres, of some frames (n,) without and with soft tissue."""
+    """Compute meshes (n, N, 3), metres, of some frames (n,) without and with soft tissue."""
     return soft.motion.vertices(character.subject(soft.motion.betas), frames), soft.vertices(character, frames)
 
 
-FULL = 0.2                           # deformation at the end of the heat map
+FULL = 0.2                           # deformation at the end of the heat map, a fifth longer or shorter
 
 
 def picture_transfer(model: BodyModel, soft: SoftTissue, character: BodyModel, moved: SoftTissue, count: int = 8,
                      height: int = 320) -> np.ndarray:
-    """Frames in three rows: the person, the character moving as `moved`, how far its skin is deformed. [MoSh]"""
+    """Render frames in three rows: the person, the character with motion `moved`, its deformation. [MoSh]"""
     frames = spread_indices(len(soft.motion.poses), count)
     person = moving_character(model, soft, frames)[1]
     fixed, changed = moving_character(character, moved, frames)
@@ -136,9 +139,9 @@ def picture_transfer(model: BodyModel, soft: SoftTissue, character: BodyModel, m
 
 
 def write_character(path: Path, character: BodyModel, soft: SoftTissue) -> tuple[np.ndarray, list[Metric]]:
-    """Write an animated GLB of soft tissue on its character, coloured by the most that its skin is deformed (N,).
+    """Write an animated GLB of soft tissue on a character, coloured by the largest deformation over time (N,).
 
-    Returned are these and how far the file is from the exact bodies.
+    Returned are the deformations and how far the file is from the exact bodies.
     """
     frames = spread_indices(len(soft.motion.poses), KEYS)
     most = np.asarray(deformation(character.template.faces, *moving_character(character, soft, frames)).max(axis=0))
@@ -150,12 +153,11 @@ def write_character(path: Path, character: BodyModel, soft: SoftTissue) -> tuple
     return most, write_glb(path, soft.motion, character.subject(soft.motion.betas), bodies, heat(most, 0.0, FULL))
 
 
-
 class Creases:
-    """Where triangles of a posed body are inverted, and the body without.
+    """Finds inverted triangles of a posed body, and smooths them.
 
-    Inverted is one that faces away from where its parts' rotations, mixed over `blend` rings, take it: at a raised
-    shoulder the skin rightly faces away from its own part.
+    A triangle is inverted when it faces away from its rest normal, rotated by its parts. Rotations are blended over
+    `blend` rings of vertices: at a raised shoulder the skin rightly faces away from its own part.
     """
 
     def __init__(self, rest: Mesh, skeleton: Skeleton, blend: int = 6) -> None:
@@ -170,7 +172,7 @@ class Creases:
             self._shares = own[rest.faces].mean(axis=1)
 
     def find_inverted(self, bodies: np.ndarray, poses: np.ndarray) -> np.ndarray:
-        """(..., F) bool: triangles of bodies (..., N, 3) in poses (..., J, 3) that face the wrong way."""
+        """Find inverted triangles (..., F) of bodies (..., N, 3) in poses (..., J, 3)."""
         corners = bodies[..., self.rest.faces, :]
         now = np.cross(corners[..., 1, :] - corners[..., 0, :], corners[..., 2, :] - corners[..., 0, :])
         R = np.tensordot(self._shares, self.skeleton.part_rotations(poses), axes=(1, -3))
@@ -178,29 +180,31 @@ class Creases:
         return np.asarray((now * (R @ self.rest.face_normals[..., None])[..., 0]).sum(axis=-1) < 0)
 
     def smooth(self, bodies: np.ndarray, poses: np.ndarray) -> np.ndarray:
-        """Bodies (n, N, 3) in poses (n, J, 3) whose folded hollows are laid as smoothly as what is around allows.
+        """Return bodies (n, N, 3) in poses (n, J, 3) with creases replaced by smooth patches.
 
-        Patches around inverted triangles grow while some are left; one that leaves more of them is not taken.
+        Patches around inverted triangles grow while some are left. A patch that leaves as many of them is not used.
         """
         out, faces = np.array(bodies), self.rest.faces
         for x, pose in zip(out, poses, strict=True):
             bad = self.find_inverted(x, pose)
-            for rings in (1, 2, 2, 3, 3, 4):             # around inverted triangles that are laid anew, one round each
+            for rings in (1, 2, 2, 3, 3, 4):             # rings of vertices around inverted triangles, in each round
                 free = np.zeros(len(x))
                 free[faces[bad]] = 1
                 for _ in range(rings - 1):
                     free = (free + self._near @ free > 0).astype(float)
-                mine = np.flatnonzero(free)
-                if len(mine) in (0, len(x)):
+                patched = np.flatnonzero(free)
+                if len(patched) in (0, len(x)):
                     continue
-                count, patch = connected_components(self._near[mine][:, mine])
+                # a harmonic patch, as smooth as its border allows
+                count, patch = connected_components(self._near[patched][:, patched])
                 trial = harmonic(self._near, x, free == 0)
                 left = self.find_inverted(trial, pose)
+                # count inverted triangles of each patch before and after
                 of_vertex = np.full(len(x), -1)
-                of_vertex[mine] = patch
+                of_vertex[patched] = patch
                 of_face = of_vertex[faces].max(axis=1)   # no triangle touches two patches
                 before, after = (np.bincount(of_face[some & (of_face >= 0)], minlength=count) for some in (bad, left))
-                kept = mine[~(after < before)[patch]]
+                kept = patched[~(after < before)[patch]]
                 trial[kept] = x[kept]
                 x[:] = trial                             # a row of `out`
                 bad = self.find_inverted(x, pose)

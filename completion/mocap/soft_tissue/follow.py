@@ -1,4 +1,4 @@
-"""How the soft tissue of a person moves, from markers: what moves is integrated out of the poses, then found.
+"""Soft tissue from markers: its movement is integrated out while poses are solved, then estimated.
 
 [MoSh] Eq. 24
 """
@@ -24,17 +24,17 @@ from ..pose.foot_contact import FootContact
 from ..pose.marked_body import RATE, AnimateConfig, MarkedBody, batches, marker_weights, point_system
 from .soft_tissue import SkinMovement, SoftTissue, in_root, in_world, smooth_modes
 
-ROUNDS = 3                           # Gauss-Newton steps over the whole sequence, which begins near its end
-LOOSE = 3.0                          # sizes of the movement by which the prior allows it; at 1 it shrinks what it finds
-WINDOW, OVERLAP = 400, 40            # frames smoothed at once, and those that each side lends to its neighbour
+ROUNDS = 3                           # Gauss-Newton steps over the whole sequence, which starts near the solution
+LOOSE = 3.0                          # prior sd over the size of the movement; at 1 the prior shrinks the result
+WINDOW, OVERLAP = 400, 40            # frames smoothed at once, and those shared with each neighbour
 
 
 @dataclass(frozen=True)
 class SoftTissueConfig(Settings):
     """Settings of `follow_soft_tissue`.
 
-    Weights stand on squared centimetres, as in the paper, whose own are `published()`. They are those by which the
-    poses were found before, see `MoshConfig`.
+    Weights are for squared centimetres, as in the paper, whose own are `SoftTissueConfig.from_paper()`. They are those
+    of the poses found before, see `MoshConfig`.
 
     Attributes
     ----------
@@ -45,17 +45,24 @@ class SoftTissueConfig(Settings):
     velocity : float
         Weight of the squared change of velocity from frame to frame, 120 frames a second; the paper's is 6.25.
     marker_sd : float, metres
-        How far a marker lies from where the moving skin has it: what cameras are off.
+        Standard deviation of a marker from the moving skin: the error of the cameras.
     reach : float, metres
-        Along the skin: where the movement of two points is correlated by 0.6.
+        Distance along the skin at which the movements of two points have a correlation of 0.6.
     temporal_smoothness : float
-        Weight of the squared second difference of the movement from frame to frame, 120 frames a second, against that
-        of the movement itself.
+        Weight of the squared second difference of the movement from frame to frame, 120 frames a second, relative to
+        that of the movement itself.
     shape_change : float
-        Weight of the squared change of the betas from the person's own, the paper's is 0.25: the betas change in every
-        frame, as in the paper. 0: the skin moves instead, as `marker_sd`, `reach` and `temporal_smoothness` say.
+        Weight of the squared change of the betas from the person's own; the paper's is 0.25. With 0 the skin moves and
+        the betas stay, by `marker_sd`, `reach` and `temporal_smoothness`.
     outlier : float, metres
         Residual at which a marker has lost three quarters of its weight.
+
+    Examples
+    --------
+    >>> SoftTissueConfig.from_paper().shape_change
+    0.25
+
+    [MoSh] Eq. 24
     """
 
     data: Positive = 2.0
@@ -69,7 +76,7 @@ class SoftTissueConfig(Settings):
 
     @classmethod
     def from_paper(cls) -> SoftTissueConfig:
-        """The weights of [MoSh] Eq. 24, whose betas change in every frame."""
+        """Return the weights of [MoSh] Eq. 24, with betas that change in every frame."""
         return cls(data=0.75, pose=1.0, velocity=6.25, outlier=1000.0, shape_change=0.25)
 
 
@@ -77,36 +84,54 @@ class SoftTissueConfig(Settings):
 def follow_soft_tissue(model: BodyModel, motion: Motion, markers: MarkerSequence, layout: MarkerLayout,
                        config: SoftTissueConfig | None = None, progress: Progress | None = None, ground: bool = False,
                        floor: tuple[float, float, float, float] | None = None) -> SoftTissue:
-    """A motion in which the skin moves on the body, as the markers tell.
+    """Estimate the soft tissue of a motion: how the skin moves on the body.
 
-    [MoSh] changes the betas in every frame and holds the change by its squared length; `published()` does so. Betas of
-    182 people have a third of the energy of a bump of 6 to 12 cm on average, so by default the skin itself moves: a
-    Gaussian process over the surface, whose size at each marker is taken from how far that marker strays. Poses are
-    found again, and a marker that strays more than most counts the less for them, so that they do not follow soft
-    tissue. Where no marker is near, the skin does not move; markers that were not seen, and those that the motion did
-    not trust, count nothing.
+    [MoSh] changes the betas in every frame, with a penalty on the squared change; `SoftTissueConfig.from_paper()` does
+    so. But betas of 182 people have only a third of the energy of a bump of 6 to 12 cm on average. So by default the
+    skin itself moves, as a Gaussian process over the surface. Its size at each marker comes from the scatter of that
+    marker. Poses are solved again; a marker with much scatter weighs less, so that they do not follow soft tissue.
+    Where no marker is near, the skin does not move. Missing and distrusted markers have no weight.
 
     Parameters
     ----------
     model : BodyModel
+        With betas.
     motion : Motion
         Of these markers, with the person's own betas.
     markers : MarkerSequence
+        Positions (T, L, 3) in metres.
     layout : MarkerLayout
         Where the markers sit on the person.
     config : SoftTissueConfig, optional
+        Settings.
     progress : callable, optional
         Called with (done, total) frames.
     ground : bool
-        Feet neither sink into the floor nor slide while they stand on it, as by `AnimateConfig.ground`.
+        Foot contact, as by `AnimateConfig.ground`.
     floor : four numbers, optional
         A unit normal that points up, and the height of the floor along it, metres; else both come from the motion.
+
+    Returns
+    -------
+    SoftTissue
+        The motion with poses (T, J, 3) found again, and the movement of the skin, metres, or of the betas (T, K).
 
     Raises
     ------
     ValueError
         A motion without betas, or of other markers; a model without betas; fewer than 3 markers in common; settings
         out of range.
+
+    Examples
+    --------
+    >>> from completion import animate, load_layout
+    >>> from model import load_built_in_model
+    >>> model = load_built_in_model()
+    >>> layout = load_layout("cmu41", model.template, np.array(model.info["people_vertices"]))
+    >>> still = MarkerSequence(np.stack([layout.place(model.template)] * 5), layout.labels, 120.0)
+    >>> motion = animate(model.subject(np.zeros(2)), still, layout)
+    >>> follow_soft_tissue(model, motion, still, layout).skin.moved.shape
+    (5, 41, 3)
 
     [MoSh] Eq. 24
     """
@@ -119,26 +144,28 @@ def follow_soft_tissue(model: BodyModel, motion: Motion, markers: MarkerSequence
     if motion.labels != markers.labels or len(motion.poses) != len(markers.positions):
         raise ValueError(f"motion: expected the one of these markers ({len(markers.positions)} frames, "
                          f"{len(markers.labels)} labels), got {len(motion.poses)} frames, {len(motion.labels)} labels")
+    # the body with its markers, and foot contact if wanted
     follower = (ShapeFollower if config.shape_change else SkinFollower)(model, motion, markers, layout, config)
     body, targets, T = follower.body, follower.targets, len(motion.poses)
     x = body.body.join(motion.poses, motion.trans)
     feet = FootContact(body, x, markers.rate, floor) if ground and T > 2 else None
 
-    # how much each marker counts, and the frames from the first to the last in which any does
+    # robust weights of the markers, and the frames from the first to the last with any weight
     share, _ = marker_weights(body.positions(x), targets, 1.0, config.outlier)
     share *= motion.trusted[:, follower.rows]
-    some = np.flatnonzero((share > 0).any(axis=1))
-    some = np.arange(some[0], some[-1] + 1) if len(some) else some
+    used = np.flatnonzero((share > 0).any(axis=1))
+    used = np.arange(used[0], used[-1] + 1) if len(used) else used
 
     # the poses, then what moves on them
     last = np.zeros(T)
-    for i in range(ROUNDS if len(some) > 2 else 0):
-        before = body.positions(x[some])
-        x[some] = follower.step_poses(x[some], targets[some], share[some], feet,
-                                      None if feet is None else feet.target_positions(x)[some])
-        last[some] = np.linalg.norm(body.positions(x[some]) - before, axis=2).max(axis=1)
+    for i in range(ROUNDS if len(used) > 2 else 0):
+        before = body.positions(x[used])
+        x[used] = follower.step_poses(x[used], targets[used], share[used], feet,
+                                      None if feet is None else feet.target_positions(x)[used])
+        last[used] = np.linalg.norm(body.positions(x[used]) - before, axis=2).max(axis=1)
         tell(round(T * (i + 1) / (ROUNDS + 1)), T)
-    added, changes, skin = follower.solve_movement(x, some, share)
+    # the movement, given the poses, and the residuals with it
+    added, changes, skin = follower.solve_movement(x, used, share)
     tell(T, T)
     pose, trans, _ = body.body.split(x)
     residuals = np.full(markers.positions.shape[:2], np.nan)
@@ -151,10 +178,10 @@ Whitening = Callable[[np.ndarray, np.ndarray], np.ndarray]
 
 
 class SoftFollower(ABC):
-    """The markers of a sequence, and the body that carries them; arguments as of `follow_soft_tissue`.
+    """The markers of a sequence, and the body that carries them; arguments are those of `follow_soft_tissue`.
 
-    Unknowns are x (T, P) as in `MarkedBody`. What soft tissue does to the markers is a Gaussian variable: it adds to
-    the covariance of their residuals while poses are sought, and is found at the end.
+    Unknowns are x (T, P) as in `MarkedBody`. The displacement of the markers by soft tissue is a Gaussian variable. It
+    adds to the covariance of their residuals while poses are solved, and is estimated at the end.
     """
 
     def __init__(self, model: BodyModel, motion: Motion, markers: MarkerSequence, layout: MarkerLayout,
@@ -163,36 +190,36 @@ class SoftFollower(ABC):
         self.rows, self.layout = layout.match_columns(markers.labels)
         self.config, self.n_betas, self.targets = config, len(motion.betas), markers.positions[:, self.rows]
         poses = AnimateConfig(prior_weight=config.pose, angle_acceleration=RATE**2 / np.sqrt(config.velocity))
-        if config.shape_change:                  # as the paper: its prior is not shrunk, and places are not smoothed
+        if config.shape_change:                  # as in the paper: no shrinkage of the prior, no smoothing of places
             poses = replace(poses, prior_shrinkage=0.0, place_acceleration=1e6)
         self.body = MarkedBody(model.subject(motion.betas), self.layout, config.pose, poses.prior_shrinkage)
         self.inertia = poses.inertia(markers.rate, self.body.n_unknowns)
-        # of a weight on square centimetres
+        # 1e4: from square centimetres to square metres
         self.weight = config.data * 1e4
 
     @abstractmethod
     def whitening(self, x: np.ndarray, targets: np.ndarray, share: np.ndarray) -> Whitening:
-        """What makes the residuals of markers independent, see `whiten`, by the x and the share of some frames.
+        """Return a function of x and the weights of some frames that gives whitening matrices, see `whiten`.
 
-        (B, L, L) if the three coordinates are independent of each other and alike, else (B, 3L, 3L).
+        They are (B, L, L) where the three coordinates are independent and alike, else (B, 3L, 3L).
         """
 
     @abstractmethod
     def solve_movement(self, x: np.ndarray, some: np.ndarray, share: np.ndarray
                        ) -> tuple[np.ndarray, np.ndarray, SkinMovement | None]:
-        """The movement in all frames x (T, P), that of frames without a marker that counts, not in `some`, none.
+        """Estimate the movement in all frames x (T, P); it is zero in frames outside `some`, which have no markers.
 
-        What it adds to the places of the markers (T, L, 3), metres, and how `SoftTissue` holds it.
+        Returned are the displacements of the markers (T, L, 3), metres, the changes of betas (T, K) and the skin.
         """
 
     def off(self, x: np.ndarray, targets: np.ndarray) -> np.ndarray:
-        """Where markers are against the body at x (B, P), metres (B, L, 3), 0 for one not seen."""
+        """Compute offsets (B, L, 3), metres, of markers from the body at x (B, P), 0 for one not seen."""
         away = targets - self.body.positions(x)
         return np.where(np.isnan(away), 0.0, away)
 
     def step_poses(self, x: np.ndarray, targets: np.ndarray, share: np.ndarray, feet: FootContact | None,
                    places: np.ndarray | None) -> np.ndarray:
-        """Frames (T, P) that follow each other after one Gauss-Newton step, the movement integrated out."""
+        """Take one Gauss-Newton step of successive frames (T, P), with the movement integrated out."""
         whitening = self.whitening(x, targets, share)
 
         def system(x: np.ndarray, targets: np.ndarray, share: np.ndarray, *places: np.ndarray) -> Dense:
@@ -203,7 +230,7 @@ class SoftFollower(ABC):
         return self.body.smooth_step(x, self.inertia, system, targets, share, *held)
 
     def system(self, x: np.ndarray, targets: np.ndarray, W: np.ndarray) -> Dense:
-        """Markers (B, L, 3) whose residuals W (B, n, n) makes independent, and the pose prior, at x (B, P).
+        """Build the equations of markers (B, L, 3), whitened by W (B, n, n), and of the pose prior, at x (B, P).
 
         n is L for each coordinate by itself, or 3L.
         """
@@ -217,7 +244,7 @@ class SoftFollower(ABC):
 
 
 class SkinFollower(SoftFollower):
-    """The skin moves on the body, a Gaussian process along it and along the axes of the root."""
+    """The skin moves on the body: a Gaussian process over the surface, along the axes of the root."""
 
     def __init__(self, model: BodyModel, motion: Motion, markers: MarkerSequence, layout: MarkerLayout,
                  config: SoftTissueConfig) -> None:
@@ -226,14 +253,16 @@ class SkinFollower(SoftFollower):
         self.smoothness = config.temporal_smoothness * (markers.rate / RATE)**4
 
     def whitening(self, x: np.ndarray, targets: np.ndarray, share: np.ndarray) -> Whitening:
+        """Return whitening by the scatter of the markers, correlated over the skin."""
         strays = variances(self.off(x, targets), share)
-        # how far most markers lie off, two medians (squared), is noise to the pose; what one is beyond, soft tissue
+        # twice the median variance is noise of the pose; what a marker has beyond it is soft tissue
         noise = max(2.0 * float(np.median(strays)), self.config.marker_sd**2)
         root = np.sqrt(np.maximum(strays / noise - 1, 0))[:, None] * self.root
         return lambda x, share: whiten(root @ root.T, share)
 
     def solve_movement(self, x: np.ndarray, some: np.ndarray, share: np.ndarray
                        ) -> tuple[np.ndarray, np.ndarray, SkinMovement | None]:
+        """Estimate the movement of the skin in the axes of the root; the betas do not change."""
         moved, poses = np.zeros(self.targets.shape), self.body.body.split(x)[0]
         if len(some):
             moved[some] = self.solve_displacements(in_root(self.off(x[some], self.targets[some]), poses[some]),
@@ -241,13 +270,14 @@ class SkinFollower(SoftFollower):
         return in_world(moved, poses), np.zeros((len(x), self.n_betas)), SkinMovement(self.modes, moved)
 
     def solve_displacements(self, off: np.ndarray, share: np.ndarray) -> np.ndarray:
-        """The movement of the skin under the markers (T, L, 3), metres, which lie off the body (T, L, 3).
+        """Solve for displacements of the skin (T, L, 3), metres, under markers that are off the body by (T, L, 3).
 
-        [MoSh] Eq. 24, with |z|² in place of |β_t|²
+        [MoSh] Eq. 24, with z in place of β_t
         """
         sd = self.config.marker_sd
         size = LOOSE * np.sqrt(np.maximum(variances(off, share) - sd**2, (0.1 * sd)**2))
         root = size[:, None] * self.root                                       # the movement is root @ z, z ~ N(0, 1)
+        # minimise Σ |root z - off|² / sd² + |z|² + smoothness |second difference of z|², in overlapping windows
         z, coupled = np.empty((len(off), root.shape[1], 3)), len(off) > 2
         for near, kept, where in overlapping_windows(len(off), WINDOW, OVERLAP) if coupled else [(slice(None),) * 3]:
             counts = share[near, :, None] / sd**2
@@ -257,23 +287,24 @@ class SkinFollower(SoftFollower):
 
 
 class ShapeFollower(SoftFollower):
-    """The betas change in every frame, β_t = β + z_t, at a cost of λ_Δ |z_t|². [MoSh] Eq. 24"""
+    """The betas change in every frame, β_t = β + z_t, with the penalty λ_Δ |z_t|². [MoSh] Eq. 24"""
 
     def __init__(self, model: BodyModel, motion: Motion, markers: MarkerSequence, layout: MarkerLayout,
                  config: SoftTissueConfig) -> None:
         super().__init__(model, motion, markers, layout, config)
-        # at most 200 betas change, or those that the person has
+        # 200 betas change, or as many as the person has if more
         self.skin = model.points(*self.layout.skin, min(max(200, self.n_betas), model.n_betas))
 
     def slopes(self, x: np.ndarray) -> np.ndarray:
-        """Derivative (B, 3L, K) of the markers by the betas at x (B, P), coordinates before markers, metres.
+        """Compute derivatives (B, 3L, K) of the markers by the betas at x (B, P), coordinates before markers, metres.
 
-        A marker moves as the skin below it.
+        A marker moves like the skin below it.
         """
         D = self.skin.shape_jacobian(self.body.body.split(x)[0])
         return np.swapaxes(D, 1, 2).reshape(len(x), -1, D.shape[-1])
 
     def whitening(self, x: np.ndarray, targets: np.ndarray, share: np.ndarray) -> Whitening:
+        """Return whitening by the covariance w_D / λ_Δ D Dᵀ of the markers, with D their derivatives by betas."""
         def of(x: np.ndarray, share: np.ndarray) -> np.ndarray:
             D = self.slopes(x)
             return whiten(self.weight / self.config.shape_change * D @ np.swapaxes(D, 1, 2), np.tile(share, 3))
@@ -281,27 +312,28 @@ class ShapeFollower(SoftFollower):
 
     def solve_movement(self, x: np.ndarray, some: np.ndarray, share: np.ndarray
                        ) -> tuple[np.ndarray, np.ndarray, SkinMovement | None]:
+        """Estimate the changes of the betas in every frame by itself: (w_D DᵀD + λ_Δ) z = w_D Dᵀ off."""
         T, K = len(x), self.skin.n_betas
         added, changes, off = np.zeros(self.targets.shape), np.zeros((T, K)), self.off(x, self.targets)
-        for few in batches(T):
-            D = self.slopes(x[few])
-            away = np.swapaxes(off[few], 1, 2).reshape(len(D), -1, 1)
-            pull = np.swapaxes(self.weight * np.tile(share[few], 3)[..., None] * D, 1, 2)
-            changes[few] = np.linalg.solve(pull @ D + self.config.shape_change * np.eye(K), pull @ away)[..., 0]
-            added[few] = np.swapaxes((D @ changes[few, :, None]).reshape(len(D), 3, -1), 1, 2)
+        for batch in batches(T):
+            D = self.slopes(x[batch])
+            away = np.swapaxes(off[batch], 1, 2).reshape(len(D), -1, 1)
+            pull = np.swapaxes(self.weight * np.tile(share[batch], 3)[..., None] * D, 1, 2)
+            changes[batch] = np.linalg.solve(pull @ D + self.config.shape_change * np.eye(K), pull @ away)[..., 0]
+            added[batch] = np.swapaxes((D @ changes[batch, :, None]).reshape(len(D), 3, -1), 1, 2)
         return added, changes, None
 
 
 def variances(off: np.ndarray, share: np.ndarray) -> np.ndarray:
-    """(L,) square metres: the mean square of a coordinate of residuals (T, L, 3), which count by their share (T, L)."""
+    """Compute the variance (L,), square metres, per coordinate of residuals (T, L, 3) with weights (T, L)."""
     return np.einsum("tl,tld->l", share, off**2) / (3 * np.maximum(share.sum(axis=0), 1e-12))
 
 
 def whiten(covariance: np.ndarray, share: np.ndarray) -> np.ndarray:
-    """W (B, n, n), with which rows r (n,) become independent, r @ W, where a unit of noise is added to the covariance.
+    """Compute W (B, n, n) that makes rows r (n,) independent, as r @ W, for a covariance plus unit noise.
 
-    The covariance C is (n, n) or (B, n, n). Noise counts by its share (B, n): `W Wᵀ = S (S C S + 1)⁻¹ S` with S the
-    roots of the shares.
+    The covariance C is (n, n) or (B, n, n). With weights `share` (B, n): `W Wᵀ = S (S C S + 1)⁻¹ S`, where S holds the
+    roots of the weights.
     """
     S, one = np.sqrt(share), np.eye(share.shape[1])
     root = np.linalg.cholesky(S[:, :, None] * covariance * S[:, None] + one)

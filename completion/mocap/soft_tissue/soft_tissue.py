@@ -1,4 +1,4 @@
-"""Soft tissue: a person whose skin or shape moves a little in every frame. [MoSh] Eq. 24"""
+"""Soft tissue: a motion in which the skin or the shape changes a little in every frame. [MoSh] Eq. 24"""
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
@@ -14,8 +14,8 @@ from scanprep.geometry.mesh import Mesh
 
 from ...motion import Motion
 
-CHANGES, MODES, MOVED = "shape_changes", "skin_modes", "skin_moved"       # in a motion file
-AT_ONCE = 32                         # bodies that are made together
+CHANGES, MODES, MOVED = "shape_changes", "skin_modes", "skin_moved"       # names of arrays in a motion file
+AT_ONCE = 32                         # bodies in memory at once
 
 
 @dataclass(frozen=True, eq=False)
@@ -25,7 +25,7 @@ class SkinMovement:
     Attributes
     ----------
     modes : (N, R) float
-        What share every vertex has in the displacement of each of R places.
+        Share of each vertex in the displacement of each of R places.
     moved : (T, R, 3) float, metres
         Displacements of the places, along the axes of the root.
     """
@@ -34,15 +34,15 @@ class SkinMovement:
     moved: np.ndarray
 
     def at(self, places: np.ndarray, poses: np.ndarray, frames: np.ndarray | slice = slice(None)) -> np.ndarray:
-        """Displacements (n, L, 3), metres, of points with shares (L, R) in some frames with their poses (n, J, 3)."""
+        """Compute displacements (n, L, 3), metres, of points with shares (L, R) in frames with poses (n, J, 3)."""
         return np.asarray(places @ in_world(self.moved[frames], poses))
 
     def times(self, factor: float) -> SkinMovement:
-        """The same, so many times as large."""
+        """Return the movement multiplied by a factor."""
         return SkinMovement(self.modes, factor * self.moved)
 
     def mean_square(self) -> np.ndarray:
-        """(N,) square metres: how far every vertex moves, the mean square over time."""
+        """Compute the mean square over time of each vertex's displacement (N,), square metres."""
         moment = np.tensordot(self.moved, self.moved, axes=((0, 2), (0, 2))) / max(len(self.moved), 1)
         return np.maximum(((self.modes @ moment) * self.modes).sum(axis=1), 0)
 
@@ -56,8 +56,8 @@ class SoftTissue:
     motion : Motion
         Poses and places, and the residuals with the moving skin; `motion.betas` is the person's own shape.
     changes : (T, K) float
-        What is added to the person's betas in every frame, as in the paper; zero where the skin moves instead. K may
-        be more than the person's betas, which are zero beyond their end.
+        Changes of the betas in every frame, as in the paper; zero where the skin moves instead. K may exceed the number
+        of the person's betas, which are zero beyond their end.
     skin : SkinMovement, optional
         How the skin moves on the body; None where betas change instead.
     """
@@ -67,21 +67,21 @@ class SoftTissue:
     skin: SkinMovement | None = None
 
     def betas(self, factor: float = 1.0) -> np.ndarray:
-        """(T, K) betas of every frame, the change taken `factor` times: more than 1 exaggerates it."""
+        """Return the betas (T, K) of every frame, with `factor` times the change: more than 1 exaggerates it."""
         assert self.motion.betas is not None, "a person of a shape space"
         own = np.zeros(self.changes.shape[1])
         own[:len(self.motion.betas)] = self.motion.betas
         return own + factor * self.changes
 
     def times(self, factor: float) -> SoftTissue:
-        """The same with soft tissue `factor` times as large."""
+        """Return the motion with `factor` times the soft tissue."""
         return replace(self, changes=factor * self.changes, skin=self.skin and self.skin.times(factor))
 
     def vertices(self, model: BodyModel, frames: np.ndarray | slice = slice(None), factor: float = 1.0,
                  subject: Subject | None = None) -> np.ndarray:
-        """The meshes (n, N, 3) of some frames, metres, soft tissue taken `factor` times.
+        """Compute the meshes (n, N, 3) of some frames, metres, with `factor` times the soft tissue.
 
-        `subject` is the person's own body where the caller has it; where betas change, each frame has another.
+        `subject` is the person's own body, if the caller has it; where betas change, each frame has another.
         """
         poses, trans = self.motion.poses[frames], self.motion.trans[frames]
         if self.changes.any():
@@ -91,10 +91,11 @@ class SoftTissue:
         return out if self.skin is None else out + factor * self.skin.at(self.skin.modes, poses, frames)
 
     def points(self, model: BodyModel, vertex_ids: np.ndarray, weights: np.ndarray) -> np.ndarray:
-        """Places (T, L, 3), metres, of points of the skin; arguments as of `Subject.points`."""
+        """Compute points (T, L, 3) of the skin, metres; arguments are those of `Subject.points`."""
         poses, K = self.motion.poses, self.changes.shape[1]
         shaped = model.points(vertex_ids, weights, K)
         out = shaped.operator(self.betas(0.0)[0]).evaluate(poses, self.motion.trans)
+        # changes of betas to first order, then the displacement of the skin
         for start in range(0, len(out) if self.changes.any() else 0, AT_ONCE):
             some = slice(start, start + AT_ONCE)
             out[some] += np.einsum("tk,tldk->tld", self.changes[some], shaped.shape_jacobian(poses[some]))
@@ -103,14 +104,14 @@ class SoftTissue:
         return out
 
     def movement(self, model: BodyModel) -> np.ndarray:
-        """How far soft tissue moves every vertex (N,) of the skin, metres: the root of the mean square over time."""
+        """Compute the root mean square displacement (N,), metres, of each vertex by soft tissue."""
         by_betas = skin_movement(model, self.changes) if self.changes.any() or self.skin is None else 0.0
         return np.sqrt(by_betas**2 + (0.0 if self.skin is None else self.skin.mean_square()))
 
     def save(self, path: str | Path) -> None:
         """Write a motion file (see `Motion.save`) that also holds soft tissue.
 
-        Versions that know changes of betas only read a moving skin as a motion of fixed shape.
+        Earlier versions, which know only changes of betas, read a moving skin as a motion of fixed shape.
         """
         more = {CHANGES: self.changes}
         if self.skin is not None:
@@ -119,12 +120,12 @@ class SoftTissue:
 
     @staticmethod
     def is_in(path: Path) -> bool:
-        """Whether a motion file holds soft tissue."""
+        """Tell whether a motion file holds soft tissue."""
         return path.suffix != ".bvh" and CHANGES in storage.names_in(path, "a motion")
 
     @staticmethod
     def load(path: str | Path) -> SoftTissue:
-        """Read a file of `save`; StorageError for one that is missing, not a motion, or of a fixed shape."""
+        """Read a file of `save`; StorageError for one that is missing, not a motion, or without soft tissue."""
         motion, stored = Motion.load(path), storage.load_arrays(path, "a motion")
         T, skin = len(motion.poses), None
         with storage.taking_apart(path, f"shape_changes, a row for each of {T} frames"):
@@ -141,33 +142,33 @@ class SoftTissue:
 
 
 def in_world(moved: np.ndarray, poses: np.ndarray) -> np.ndarray:
-    """Vectors (n, R, 3) along the axes of the root, turned into the world, in poses (n, J, 3)."""
+    """Rotate vectors (n, R, 3) from the axes of the root to the world, in poses (n, J, 3)."""
     return np.asarray(moved @ np.swapaxes(rotations.exp(poses[:, 0]), -1, -2))
 
 
 def in_root(moved: np.ndarray, poses: np.ndarray) -> np.ndarray:
-    """Vectors (n, R, 3) in the world, turned into the axes of the root, in poses (n, J, 3)."""
+    """Rotate vectors (n, R, 3) from the world to the axes of the root, in poses (n, J, 3)."""
     return np.asarray(moved @ rotations.exp(poses[:, 0]))
 
 
 def smooth_modes(skin: Mesh, places: np.ndarray, reach: float) -> tuple[np.ndarray, np.ndarray]:
-    """What displacements of some vertices (R,) tell of all others, (N, R), and a root (R, r) of their correlation.
+    """Compute modes (N, R) that interpolate displacements of vertices (R,), and a root (R, r) of their correlation.
 
-    The displacement is a Gaussian process over the skin: correlations fall with the distance along it as a bell does,
-    to exp(-1/2) at `reach`, metres. The modes are its mean, the displacements of the places given. Patterns over the
-    places that hardly occur are left out; distances along a curved surface make some impossible.
+    The displacement is a Gaussian process over the skin. Correlations fall with the distance along it like a Gaussian
+    bell, to exp(-1/2) at `reach`, metres. The modes are the conditional mean, given the displacements of the places.
+    Rare patterns are left out: distances along a curved surface make some impossible.
     """
-    distances = SurfaceGraph(skin).distances(places, limit=4 * reach)              # beyond it the bell is 0.0003
+    distances = SurfaceGraph(skin).distances(places, limit=4 * reach)              # at the limit the bell is 0.0003
     bell = np.exp(-0.5 * (distances / reach)**2)
     near = bell[:, places]
     values, vectors = np.linalg.eigh(0.5 * (near + near.T))
-    # finer patterns are noise, or none of a process
+    # 1e-2: patterns of less variance are noise, or not possible for a Gaussian process
     values, vectors = values[values > 1e-2], vectors[:, values > 1e-2]
     return bell.T @ (vectors / values) @ vectors.T, vectors * np.sqrt(values)
 
 
 def changing_bodies(model: BodyModel, poses: np.ndarray, betas: np.ndarray, trans: np.ndarray) -> np.ndarray:
-    """Vertices (T, N, 3), metres, each frame with betas of its own (T, k), exact."""
+    """Compute vertices (T, N, 3), metres, with betas (T, k) for each frame, exactly."""
     poses, trans = check_pose(model.skeleton, poses, trans)
     if betas.ndim != 2 or len(betas) != len(poses) or betas.shape[1] > model.n_betas:
         raise ValueError(f"betas: expected ({len(poses)}, k) with k at most {model.n_betas}, got {betas.shape}")
@@ -180,9 +181,9 @@ def changing_bodies(model: BodyModel, poses: np.ndarray, betas: np.ndarray, tran
 
 
 def skin_movement(model: BodyModel, changes: np.ndarray) -> np.ndarray:
-    """How far changes of betas (T, k) move every vertex (N,), metres: the root of the mean square over time.
+    """Compute the root mean square displacement (N,), metres, of each vertex by changes of betas (T, k).
 
-    In the mean pose; other poses turn the movement, and hardly lengthen it.
+    It is that in the mean pose; other poses rotate the displacement, and hardly change its length.
     """
     D = model.shape_jacobian(model.pose_mean)[..., :changes.shape[1]]
     moment = changes.T @ changes / max(len(changes), 1)

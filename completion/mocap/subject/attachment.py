@@ -1,7 +1,7 @@
-"""Latent markers: where on the skin a marker hangs, and how it follows the skin from the latent pose into others.
+"""Latent markers: how a marker is attached to the skin, and follows it from the latent pose into other poses.
 
-A marker hangs on three supports, points of the skin, with three coefficients. Nothing of it depends on betas but the
-supports, so coefficients are what is solved for: the place in the latent coordinate system follows from them.
+A marker is attached to three supports, points of the skin, by three coefficients. Only the supports depend on betas, so
+the coefficients are the unknowns: the place in the latent coordinate system follows from them.
 """
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ Attachment = Literal["triangle", "neighbourhood"]
 
 @dataclass(frozen=True, eq=False)
 class LatentMarkers:
-    """Markers on a surface: three supports each, combinations of vertices (3 L, k), and the nearest triangle (L, 3)."""
+    """Attached markers: three supports each, as combinations of vertices (3L, k), and the nearest triangle (L, 3)."""
 
     kind: Attachment
     ids: np.ndarray
@@ -30,42 +30,43 @@ class LatentMarkers:
     corners: np.ndarray
 
     def supports(self, vertices: np.ndarray) -> np.ndarray:
-        """The supports (..., 3L, 3) on a surface with vertices (..., N, 3)."""
+        """Compute the supports (..., 3L, 3) on a surface with vertices (..., N, 3)."""
         return np.einsum("lk,...lkd->...ld", self.weights, vertices[..., self.ids, :])
 
     def coefficients(self, vertices: np.ndarray, points: np.ndarray) -> np.ndarray:
-        """Coefficients (L, 3) that put markers at points (L, 3) of the latent coordinate system. [MoSh] Eq. 16"""
+        """Solve for coefficients (L, 3) that put markers at points (L, 3), metres, in the latent pose. [MoSh] Eq. 16"""
         origin, frame = _frames(self.kind, self.supports(vertices))
         return np.linalg.solve(frame, (points - origin)[..., None])[..., 0]
 
     def places(self, vertices: np.ndarray, coefficients: np.ndarray) -> np.ndarray:
-        """Where the markers are (..., L, 3) on a surface with vertices (..., N, 3). [MoSh] Eq. 16"""
+        """Compute the places (..., L, 3) of the markers on a surface with vertices (..., N, 3). [MoSh] Eq. 16"""
         origin, frame = _frames(self.kind, self.supports(vertices))
         return origin + (frame @ coefficients[..., None])[..., 0]
 
 
 def latent_markers(mesh: Mesh, points: np.ndarray, kind: Attachment = "triangle") -> LatentMarkers:
-    """Hang points (L, 3) on the surface to which they are nearest; the mesh is the body in the latent pose.
+    """Attach points (L, 3), metres, to the nearest places of a mesh, the body in the latent pose.
 
-    In the frame of the nearest triangle: normal, edge and their product; or as a sum of the edges of the nearest
-    vertex.
+    "triangle" uses the frame of the nearest triangle: edge, normal and their cross product. "neighbourhood" uses sums
+    of the edges of the nearest vertex.
 
     [MoSh] Eq. 1, Eq. 15
     """
-    found = Surface(mesh).closest(points)
-    corners = np.asarray(mesh.faces[found.faces])
+    closest = Surface(mesh).closest(points)
+    corners = np.asarray(mesh.faces[closest.faces])
     if kind == "triangle":
         return LatentMarkers(kind, corners.reshape(-1, 1), np.ones((corners.size, 1)), corners)
     if kind != "neighbourhood":
         raise ValueError(f"attachment: expected triangle or neighbourhood, got {kind!r}")
-    off = np.linalg.norm(mesh.vertices[corners] - points[:, None], axis=2)
-    nearest = np.take_along_axis(corners, off.argmin(axis=1)[:, None], axis=1)[:, 0]
+    # the nearest corner of each triangle, and the supports from its ring
+    distance = np.linalg.norm(mesh.vertices[corners] - points[:, None], axis=2)
+    nearest = np.take_along_axis(corners, distance.argmin(axis=1)[:, None], axis=1)[:, 0]
     rows = [row for centre in nearest for row in _ring_supports(mesh, int(centre))]
     return LatentMarkers(kind, *pad_combinations(rows), corners)
 
 
 def _ring_supports(mesh: Mesh, centre: int) -> list[tuple[np.ndarray, np.ndarray]]:
-    """A vertex, and the sums of least norm of its edges that reach a unit to either side of its normal.
+    """Return a vertex and the two sums of its edges, of least norm, that are unit vectors of its tangent plane.
 
     [MoSh] Eq. 2, Eq. 3
     """
@@ -77,7 +78,7 @@ def _ring_supports(mesh: Mesh, centre: int) -> list[tuple[np.ndarray, np.ndarray
 
 
 def _frames(kind: Attachment, supports: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Origins (..., L, 3) and frames (..., L, 3, 3), axes in columns, of supports (..., 3L, 3)."""
+    """Compute origins (..., L, 3) and frames (..., L, 3, 3), axes in columns, from supports (..., 3L, 3)."""
     p = supports.reshape(*supports.shape[:-2], -1, 3, 3)
     a, b = p[..., 1, :] - p[..., 0, :], p[..., 2, :] - p[..., 0, :]
     c = np.cross(a, b)
@@ -90,7 +91,7 @@ def _frames(kind: Attachment, supports: np.ndarray) -> tuple[np.ndarray, np.ndar
 
 def simulate_markers(kind: Attachment, supports: MovingPoints, coefficients: np.ndarray) -> tuple[MovingPoints,
                                                                                                   np.ndarray]:
-    """The simulated markers on 3 L supports, and their derivative (..., L, 3, 3) by their own coefficients: the frame.
+    """Compute simulated markers on 3L supports, and their derivative (..., L, 3, 3) by their own coefficients.
 
     [MoSh] Eq. 4, Eq. 16
     """
@@ -102,13 +103,15 @@ def simulate_markers(kind: Attachment, supports: MovingPoints, coefficients: np.
 
 
 def _by_supports(kind: Attachment, supports: np.ndarray, frame: np.ndarray, c: np.ndarray) -> np.ndarray:
-    """Derivative (..., L, 3, 9) of the markers by their three supports (..., 3L, 3)."""
+    """Compute the derivative (..., L, 3, 9) of the markers by their three supports (..., 3L, 3)."""
     p = supports.reshape(*supports.shape[:-2], -1, 3, 3)
     a, b = p[..., 1, :] - p[..., 0, :], p[..., 2, :] - p[..., 0, :]
     eye, n = np.eye(3), frame[..., :, 2]
     area = np.linalg.norm(np.cross(a, b), axis=-1)[..., None, None]
+    # the unit normal n = a × b / |a × b|: its derivatives by the edges a and b
     tangent = (eye - n[..., :, None] * n[..., None, :]) / area
-    n_a, n_b = -tangent @ rotations.hat(b), tangent @ rotations.hat(a)                   # normal by the two edges
+    n_a, n_b = -tangent @ rotations.hat(b), tangent @ rotations.hat(a)
+    # m̂ = p + c1 e1 + c2 e2 + c3 n, with e1 = a / |a|, e2 = n × e1 for a triangle, else e1 = a, e2 = b
     c1, c2, c3 = (c[..., i, None, None] for i in range(3))
     if kind == "triangle":
         e = frame[..., :, 0]
@@ -122,14 +125,15 @@ def _by_supports(kind: Attachment, supports: np.ndarray, frame: np.ndarray, c: n
 
 
 def above_triangles(points: np.ndarray, corners: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Signed distances (n,) of points (n, 3) from triangles (n, 3, 3), one each, and their derivatives by both.
+    """Compute signed distances (n,) of points (n, 3) from triangles (n, 3, 3), one each, and their derivatives.
 
-    [MoSh] Eq. 18. The nearest point keeps its shares of the corners to first order: each moves it by its share.
+    The nearest point keeps its barycentric weights to first order, so each corner moves it by its weight. [MoSh] Eq. 18
     """
     share = barycentric(points, corners)
     nearest = np.einsum("nc,ncd->nd", share, corners)
     best = np.where((share >= 0).all(axis=1), np.linalg.norm(points - nearest, axis=1), np.inf)
     inside = np.isfinite(best)
+    # outside the triangle the nearest point lies on one of its three edges
     for i, j in ((0, 1), (1, 2), (2, 0)):
         edge = corners[:, j] - corners[:, i]
         t = np.einsum("nd,nd->n", points - corners[:, i], edge) / np.einsum("nd,nd->n", edge, edge)
@@ -139,6 +143,7 @@ def above_triangles(points: np.ndarray, corners: np.ndarray) -> tuple[np.ndarray
         best = np.where(better, far, best)
         share[better] = 0
         share[better, i], share[better, j] = 1 - t[better], t[better]
+    # positive on the side of the normal; on the surface itself the direction is the normal
     off = points - np.einsum("nc,ncd->nd", share, corners)
     normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     normal /= np.linalg.norm(normal, axis=1, keepdims=True)

@@ -1,6 +1,6 @@
-"""Betas, latent markers and the poses of some frames, all together: the terms of Eq. 23 and their minimum.
+"""Fit betas, latent markers and the poses of some frames together: the terms of [MoSh] Eq. 23 and their minimum.
 
-Unknowns that frames share are a row `z = (betas (K), coefficients of the latent markers (3 L))`, those of one frame
+Frames share the unknowns `z = (betas (K), coefficients of the latent markers (3L))`; those of one frame are
 `x = (pose (3J), trans (3))`. Distances are in centimetres inside the terms, so that weights compare with the paper's.
 """
 from __future__ import annotations
@@ -25,30 +25,30 @@ from ..pose.marked_body import supports
 from .attachment import Attachment, LatentMarkers, above_triangles, latent_markers, simulate_markers
 from .frame_starts import find_loose
 
-CENTIMETRES = 100.0                  # in a metre
-ON_SKIN = 0.016                      # metres from a distance that the marker set names, within which it is that one
+CENTIMETRES = 100.0                  # per metre; the paper's weights are for squared centimetres
+ON_SKIN = 0.016                      # metres; a found distance this close to one of the marker set becomes that one
 
 
 @dataclass(frozen=True)
 class PersonConfig(Settings):
     """Settings of `find_person`: the shape of a person and where the markers really sit, from some frames.
 
-    Weights stand on squared distances in centimetres, on squared standard deviations of betas and on the squared
-    Mahalanobis distance of poses, as in the paper: they are inverse variances, next to a shape prior of weight one.
-    What is wrong in one frame is wrong in others too, so the terms of frames, data and pose, count a quarter: twelve
-    frames are worth three. The paper's values are `published()`. Ours differ in three, measured on recordings of four
-    actors, along each axis: a marker is 4 mm off from frame to frame (a quarter of 1/0.4²), where it sits is 10 mm
-    beside its usual place, and the model's skin is 5 mm off the true one. With a skin that is believed to a millimetre,
-    betas explain where the markers sit, and come out twice too long.
+    Weights are for squared distances in centimetres, squared standard deviations of betas and squared Mahalanobis
+    distances of poses, as in the paper. They are inverse variances, relative to a shape prior of weight one. Errors of
+    successive frames are correlated, so the terms of frames, data and pose, count a quarter: twelve frames are worth
+    three. `PersonConfig.from_paper()` has the values of the paper. Ours differ in three, measured on recordings of four
+    actors, along each axis: a marker is 4 mm off from frame to frame (a quarter of 1/0.4²), sits 10 mm from its usual
+    place, and the model's skin is 5 mm off the true one. With a skin that is exact to a millimetre, betas explain the
+    places of markers, and come out twice too large.
 
     Attributes
     ----------
     frames : int
-        Frames that are used, over all sequences.
+        Number of frames, over all sequences.
     choice : "spread" or "random"
-        Frames that differ most, or drawn at random.
+        Frames that differ most, or random ones.
     n_betas : int
-        Betas that are looked for, at most; the others stay zero.
+        Largest number of betas; the others stay zero.
     attachment : "triangle" or "neighbourhood"
         A latent marker in the coordinate frame of its nearest triangle, or as a sum of the neighbours of its
         nearest vertex and the normal there.
@@ -57,23 +57,29 @@ class PersonConfig(Settings):
     surface : float
         Weight of the prescribed distance from the skin; the paper's is 100.
     initial : float
-        Weight of the usual place of a marker; the paper's is 0.25, and 10000 takes the layout's places as known.
+        Weight of the usual place of a marker; the paper's is 0.25, and 10000 fixes the layout's places.
     shape : float
-        Weight of the shape prior; 1 takes people as the model says that they are spread.
+        Weight of the shape prior; 1 is the distribution of people in the model.
     pose : float
         Weight of the pose prior.
     annealing : floats
         Factors on the last three weights, one stage each.
     outlier : float, metres
-        Residual at which a marker has lost three quarters of its weight; the paper weighs all alike.
+        Residual at which a marker has lost three quarters of its weight; the paper weights all equally.
     loose : bool
-        Look along their limb for markers that the layout calls loose, and hold them there by 20 cm; the paper holds
-        all alike.
+        Search loose markers of the layout along their limb, with a standard deviation of 20 cm; the paper treats all
+        equally.
     wand : float, metres
-        How much farther from the skin than the layout says a marker that may be on a wand, or one on a bar, can be.
-        0 takes all distances as the layout has them, as the paper does.
+        Largest extra distance from the skin of markers on wands or bars; 0 keeps the layout's distances, as the paper.
     seed : int
-        Of the frames drawn at random.
+        Of the random frames.
+
+    Examples
+    --------
+    >>> PersonConfig.from_paper().annealing
+    (40.0, 20.0, 10.0, 4.0, 2.0, 1.0)
+
+    [MoSh] Eq. 23
     """
 
     frames: Count = 12
@@ -93,35 +99,35 @@ class PersonConfig(Settings):
 
     @classmethod
     def from_paper(cls) -> PersonConfig:
-        """Weights, twelve random frames and six stages of [MoSh], all markers alike."""
+        """Return the weights of [MoSh], with twelve random frames, six stages and equal markers."""
         return cls(choice="random", data=0.75, surface=100.0, initial=0.25, outlier=1000.0, loose=False, wand=0.0)
 
 
 @dataclass(frozen=True, eq=False)
 class LatentPoints:
-    """Points of the skin in the latent pose, affine in betas: `mean` (..., 3) and `by_betas` (..., 3, K), metres."""
+    """Points of the skin in the latent pose, affine in betas: `mean` (..., 3), `by_betas` (..., 3, K), metres."""
 
     mean: np.ndarray
     by_betas: np.ndarray
 
     def at(self, betas: np.ndarray) -> np.ndarray:
-        """Their places (..., 3) for betas (K,)."""
+        """Compute the places (..., 3) for betas (K,)."""
         return self.mean + self.by_betas @ betas
 
     def moving(self, z: np.ndarray) -> MovingPoints:
-        """The same for unknowns z (P,), with derivatives by all of them."""
+        """Compute the places for unknowns z (P,), with derivatives by all of them."""
         K = self.by_betas.shape[-1]
         rest = np.zeros((*self.mean.shape, len(z) - K))
         return MovingPoints(self.at(z[:K]), np.concatenate([self.by_betas, rest], axis=-1))
 
     def combine(self, ids: np.ndarray, weights: np.ndarray) -> LatentPoints:
-        """Combinations of some of them, ids and weights (n, k)."""
+        """Return weighted sums of some points, by ids and weights (n, k)."""
         return LatentPoints(np.einsum("lk,lkd->ld", weights, self.mean[ids]),
                             np.einsum("lk,lkdb->ldb", weights, self.by_betas[ids]))
 
 
 def latent_places(kind: Attachment, points: LatentPoints, z: np.ndarray) -> MovingPoints:
-    """The latent markers (L) in the latent coordinate system, from their 3 L supports. [MoSh] Eq. 16"""
+    """Compute the latent markers (L) in the latent coordinate system, from their 3L supports. [MoSh] Eq. 16"""
     K = points.by_betas.shape[-1]
     found, frame = simulate_markers(kind, points.moving(z), z[K:].reshape(-1, 3))
     found.jacobian[..., K:] += each_own(frame)
@@ -129,7 +135,7 @@ def latent_places(kind: Attachment, points: LatentPoints, z: np.ndarray) -> Movi
 
 
 def each_own(frame: np.ndarray) -> np.ndarray:
-    """Derivatives (..., L, 3, 3) of every marker by its own coefficients as those by all of them, (..., L, 3, 3L)."""
+    """Expand derivatives (..., L, 3, 3) of each marker by its own coefficients to those by all, (..., L, 3, 3L)."""
     L = frame.shape[-3]
     out = np.zeros((*frame.shape[:-1], L, 3))
     i = np.arange(L)
@@ -138,10 +144,10 @@ def each_own(frame: np.ndarray) -> np.ndarray:
 
 
 def distance_reach(layout: MarkerLayout, wand: float) -> tuple[np.ndarray, np.ndarray]:
-    """The least and the greatest distance (L,) of every marker from the skin, metres.
+    """Return the least and the greatest distance (L,) of every marker from the skin, metres.
 
-    That of the layout, but for markers that some wear on wands, and for those that the layout itself has away from the
-    skin, on bars, which others wear without: there up to `wand` more, and down to the skin.
+    Both are the layout's, but for two kinds of markers: those that may be on wands, and those that the layout has away
+    from the skin, on bars. These may be up to `wand` farther off, or on the skin.
     """
     distances = np.asarray(layout.distances)
     free = (np.isin(layout.labels, layout.wands) | (distances > DISTANCE + ON_SKIN)) & (wand > 0)
@@ -150,16 +156,16 @@ def distance_reach(layout: MarkerLayout, wand: float) -> tuple[np.ndarray, np.nd
 
 
 def marker_term(points: MovingPoints, targets: np.ndarray, weights: np.ndarray) -> Residual:
-    """Simulated markers against observed ones (..., L, 3); what was not seen (NaN) counts nothing. [MoSh] Eq. 17"""
+    """Residual of simulated against observed markers (..., L, 3), NaN without weight. [MoSh] Eq. 17, E_D"""
     return energy.point_to_point(points, targets, CENTIMETRES**2 * weights)
 
 
 def surface_term(markers: MovingPoints, corners: MovingPoints, least: np.ndarray, greatest: np.ndarray, weight: float
                  ) -> Residual:
-    """Latent markers at their distance from the nearest triangles, of 3 L corners. [MoSh] Eq. 18
+    """Residual of the distance of latent markers from the nearest triangles, of 3L corners. [MoSh] Eq. 18, E_S
 
-    The distance is an unknown with an even prior between the least and the greatest (L,), metres, which has its best
-    value here; where both are the same, it is the paper's prescribed one.
+    The distance is an unknown with a uniform prior between the least and the greatest (L,), metres, at its best value.
+    Where both are the same, it is the paper's prescribed distance.
     """
     L, P = len(least), markers.jacobian.shape[-1]
     r, by_point, by_corners = above_triangles(markers.positions, corners.positions.reshape(L, 3, 3))
@@ -172,7 +178,7 @@ def surface_term(markers: MovingPoints, corners: MovingPoints, least: np.ndarray
 
 
 def place_term(markers: MovingPoints, usual: MovingPoints, weights: np.ndarray) -> Residual:
-    """Latent markers near their usual place on this body, weights (L,). [MoSh] Eq. 19"""
+    """Residual of latent markers against their usual places on this body, weights (L,). [MoSh] Eq. 19, E_I"""
     root = CENTIMETRES * np.sqrt(weights)[:, None]
     r = root * (markers.positions - usual.positions)
     J = root[..., None] * (markers.jacobian - usual.jacobian)
@@ -180,52 +186,52 @@ def place_term(markers: MovingPoints, usual: MovingPoints, weights: np.ndarray) 
 
 
 def shape_term(z: np.ndarray, n_betas: int, weight: float) -> Residual:
-    """Squared Mahalanobis distance of the betas, standard deviations, from the mean person. [MoSh] Eq. 20"""
-    found = energy.shape_prior(z[..., :n_betas], 0, weight)
-    J = np.zeros((*found.values.shape, z.shape[-1]))
-    J[..., :n_betas] = found.jacobian
-    return Residual(found.values, J)
+    """Residual of the betas: their squared Mahalanobis distance from the mean person. [MoSh] Eq. 20, E_β"""
+    prior = energy.shape_prior(z[..., :n_betas], 0, weight)
+    J = np.zeros((*prior.values.shape, z.shape[-1]))
+    J[..., :n_betas] = prior.jacobian
+    return Residual(prior.values, J)
 
 
 @dataclass(frozen=True, eq=False)
 class LatentState:
-    """Where the solution stands."""
+    """The unknowns, and how the markers are attached at present."""
 
-    x: np.ndarray                        # (B, 3J + 3) pose and place in every frame
+    x: np.ndarray                        # (B, 3J + 3) pose and place of every frame
     betas: np.ndarray                    # (K,)
     coefficients: np.ndarray             # (L, 3) of the latent markers
-    markers: LatentMarkers               # what they are coefficients of
-    points: ShapedPoints                 # their supports on the body, posed and of any shape
+    markers: LatentMarkers               # the supports that these coefficients are of
+    points: ShapedPoints                 # the supports on the body, in any pose and shape
     supports: LatentPoints               # the same in the latent pose
-    corners: LatentPoints                # of the nearest triangles in the latent pose
-    layout: MarkerLayout                 # where the markers usually are, loose ones where they were found
-    least: np.ndarray                    # (L,) metres from the skin, between which the distance of each is unknown,
-    greatest: np.ndarray                 # or that of the layout
-    looked: bool = False                 # loose markers were looked for
+    corners: LatentPoints                # corners of the nearest triangles in the latent pose
+    layout: MarkerLayout                 # usual places; loose markers where they were found
+    least: np.ndarray                    # (L,) metres, least distance from the skin
+    greatest: np.ndarray                 # (L,) metres, greatest; both the layout's where the distance is known
+    looked: bool = False                 # loose markers were searched
 
     @property
     def z(self) -> np.ndarray:
-        """(K + 3L,) what the frames share."""
+        """Unknowns (K + 3L,) that the frames share."""
         return np.concatenate([self.betas, self.coefficients.ravel()])
 
     @property
     def places(self) -> np.ndarray:
-        """The latent markers (L, 3) in the latent coordinate system, metres."""
+        """Latent markers (L, 3) in the latent coordinate system, metres."""
         return latent_places(self.markers.kind, self.supports, self.z).positions
 
     @property
     def rows(self) -> np.ndarray:
-        """(B, 3J + 3 + K + 3L) all unknowns, those that frames share in every row."""
+        """All unknowns (B, 3J + 3 + K + 3L), with the shared ones in every row."""
         return np.concatenate([self.x, np.tile(self.z, (len(self.x), 1))], axis=1)
 
     def with_unknowns(self, rows: np.ndarray) -> LatentState:
-        """The state with other unknowns."""
+        """Return the state with other unknowns."""
         n, K = self.x.shape[1], len(self.betas)
         return replace(self, x=rows[:, :n], betas=rows[0, n:n + K], coefficients=rows[0, n + K:].reshape(-1, 3))
 
 
 class LatentFit:
-    """Markers (B, L, 3) of some frames, metres, on a body of unknown shape, about where a layout has them."""
+    """Fit of markers (B, L, 3), metres, of some frames on a body of unknown shape, near the places of a layout."""
 
     def __init__(self, model: BodyModel, layout: MarkerLayout, targets: np.ndarray, config: PersonConfig) -> None:
         self.model, self.layout, self.targets, self.config = model, layout, targets, config
@@ -237,48 +243,50 @@ class LatentFit:
         self.prior = gaussian_prior(model.pose_mean, model.pose_covariance)
         self.loose = np.isin(layout.labels, layout.loose) & config.loose
         self.reach = distance_reach(layout, config.wand)
-        # weight of the usual place of a marker that the layout calls loose: 20 cm
+        # usual place of a loose marker: 0.0025 is a standard deviation of 20 cm
         self.place_weight = np.where(self.loose, min(0.0025, config.initial), config.initial)
         self._column: dict[bytes, int] = {}
         self._made: ShapedPoints | None = None
 
     def split(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Poses (B, J, 3) and places (B, 3) of unknowns (B, 3J + 3)."""
+        """Split unknowns (B, 3J + 3) into poses (B, J, 3) and places (B, 3)."""
         return x[:, :self.n_angles].reshape(len(x), -1, 3), x[:, self.n_angles:]
 
     def start(self, x: np.ndarray) -> LatentState:
-        """The mean person with the markers in their usual places, at poses (B, 3J + 3) that were found for it."""
+        """Start from the mean person, markers in their usual places, and poses (B, 3J + 3) that were found for it."""
         betas = np.zeros(self.n_betas)
         return self._attach(x, betas, self.usual_places(self.layout, betas), self.layout, self.reach, False)
 
     def reattach(self, state: LatentState, look: bool, last: bool) -> LatentState:
-        """The same places on the triangles that are nearest now; to `look` finds loose markers along their limbs.
+        """Attach the markers at their present places to the nearest triangles; `look` searches loose markers first.
 
-        The `last` time the distances that are near one that the marker set names become that one.
+        The `last` time, distances close to one of the marker set become that one.
         """
         layout, places, looked = state.layout, state.places, state.looked
         if look and self.loose.any():
+            # loose markers along their limbs, on the bodies of all frames
             vertices = self.model.subject(state.betas).vertices(*self.split(state.x))
-            found, distances = find_loose(self.model, vertices, self.layout, self.targets, self.reach)
-            layout, looked = replace(self.layout.with_places(found), distances=distances), True
+            vertex_of, distances = find_loose(self.model, vertices, self.layout, self.targets, self.reach)
+            layout, looked = replace(self.layout.with_places(vertex_of), distances=distances), True
             places = np.where(self.loose[:, None], self.usual_places(layout, state.betas), places)
         state = self._attach(state.x, state.betas, places, layout, (state.least, state.greatest), looked)
         return self._measure_distances(state, last)
 
     def _measure_distances(self, state: LatentState, last: bool) -> LatentState:
-        """The state with the distances of its markers from the skin as they are now, where they are unknown."""
+        """Return the state with unknown distances from the skin set to their present values."""
         free = state.least < state.greatest
         if not free.any():
             return state
         corners = state.corners.at(state.betas).reshape(-1, 3, 3)
         r = np.clip(above_triangles(state.places, corners)[0], state.least, state.greatest)
-        distances, given = np.where(free, r, np.asarray(state.layout.distances)), np.asarray(self.layout.distances)
+        distances, usual = np.where(free, r, np.asarray(state.layout.distances)), np.asarray(self.layout.distances)
         if last:
-            # both sides are worn alike, and together they tell with less error than one alone
+            # left and right markers are mounted alike, and their mean has less error than one alone
             pairs = label_pairs(self.layout.labels)
             paired = (pairs >= 0) & free[pairs]
             both, limit = np.where(paired, (r + r[pairs]) / 2, r), np.where(paired, ON_SKIN, np.sqrt(2) * ON_SKIN)
-            for named in (np.full(len(r), DISTANCE), given):
+            # close to the common distance, or to the layout's own: it is that one, and known from now on
+            for named in (np.full(len(r), DISTANCE), usual):
                 near = free & (np.abs(both - named) < limit)
                 distances, free = np.where(near, named, distances), free & ~near
         return replace(state, layout=replace(state.layout, distances=distances),
@@ -286,7 +294,7 @@ class LatentFit:
 
     def _attach(self, x: np.ndarray, betas: np.ndarray, points: np.ndarray, layout: MarkerLayout,
                 reach: tuple[np.ndarray, np.ndarray], looked: bool) -> LatentState:
-        """The state with markers at points (L, 3) of the latent coordinate system, each on its nearest triangle."""
+        """Return the state with markers at points (L, 3) of the latent pose, each attached to its nearest triangle."""
         vertices = self.latent.at(betas)
         markers = latent_markers(self.model.template.with_vertices(vertices), points, self.config.attachment)
         corners = self.latent.combine(markers.corners.reshape(-1, 1), np.ones((3 * len(points), 1)))
@@ -294,7 +302,7 @@ class LatentFit:
                            self.latent.combine(markers.ids, markers.weights), corners, layout, *reach, looked)
 
     def _supports(self, markers: LatentMarkers) -> ShapedPoints:
-        """Points of the skin with free shape, each made once: stitching them is what hanging markers anew costs."""
+        """Return the supports with free shape; each is made once, as stitching them is the cost of attaching again."""
         keys = [ids.tobytes() + weights.tobytes() for ids, weights in zip(markers.ids, markers.weights, strict=True)]
         new = {key: row for row, key in enumerate(keys) if key not in self._column}
         if new:
@@ -307,14 +315,15 @@ class LatentFit:
                                                       None))
 
     def usual_places(self, layout: MarkerLayout, betas: np.ndarray) -> np.ndarray:
-        """Where a layout has the markers (L, 3) on a body of these betas in the latent pose, metres. [MoSh] Eq. 15"""
+        """Compute usual places (L, 3), metres, on a body of these betas in the latent pose. [MoSh] Eq. 15"""
         return energy.rise_above_skin(self._usual(layout).at(betas), np.asarray(layout.distances))
 
     def _usual(self, layout: MarkerLayout) -> LatentPoints:
+        """Return the supports of a layout's places in the latent pose."""
         return self.latent.combine(*supports(self.model.template, layout))
 
     def simulate(self, state: LatentState, x: np.ndarray, z: np.ndarray) -> MovingPoints:
-        """The markers in every frame for x (B, n) and z (K + 3L,), derivatives by both. [MoSh] Eq. 16"""
+        """Simulate the markers in every frame for x (B, n) and z (K + 3L,), with derivatives by both. [MoSh] Eq. 16"""
         K, (pose, trans) = self.n_betas, self.split(x)
         positions, d_pose = state.points.operator(z[:K]).jacobian(pose, trans)
         moving = energy.moving_points(positions, d_pose, state.points.shape_jacobian(pose))
@@ -322,42 +331,43 @@ class LatentFit:
         return MovingPoints(found.positions, np.concatenate([found.jacobian, each_own(frame)], axis=-1))
 
     def residuals(self, state: LatentState) -> np.ndarray:
-        """(B, L) distances of simulated from observed markers, metres; NaN where one was not seen."""
+        """Compute distances (B, L) of simulated from observed markers, metres; NaN where one was not seen."""
         return np.linalg.norm(self.simulate(state, state.x, state.z).positions - self.targets, axis=2)
 
     def weights(self, state: LatentState) -> np.ndarray:
-        """(B, L) weights of the data, per square centimetre; outliers have less, as loose markers not yet found."""
+        """Compute the weights (B, L) of the data, per square centimetre, low for outliers and unfound loose markers."""
         off = self.residuals(state)
         usual = np.nanmedian(off, axis=1, keepdims=True)
         share = energy.geman_mcclure(np.nan_to_num(off), np.maximum(self.config.outlier, 3 * usual))
-        # how much farther off a loose marker may be before it was looked for
+        # 5: a loose marker may be that many times farther off before it was searched
         return self.config.data * share / np.where(self.loose & (not state.looked), 5.0, 1.0)**2
 
     def solve(self, state: LatentState, factor: float, last: bool) -> tuple[np.ndarray, bool, int]:
-        """One stage of [MoSh] Eq. 23, everything together: unknowns as `State.rows`, whether it settled, and steps."""
+        """Minimise [MoSh] Eq. 23 in one stage; return unknowns as `LatentState.rows`, convergence and steps."""
         weights, usual, n = self.weights(state), self._usual(state.layout), state.x.shape[1]
 
         def equations(rows: np.ndarray) -> Arrow:
             x, z = rows[:, :n], rows[0, n:]
-            common = [Residual(r.values[None], r.jacobian[None]) for r in self.shared_terms(state, usual, z,
-                                                                                            factor).values()]
-            return Arrow(normal_equations(list(self.of_frames(state, x, z, weights, factor).values())), len(z),
-                         normal_equations(common))
+            # an arrow matrix: a block for each frame, and a border for what frames share
+            shared = self.shared_terms(state, usual, z, factor).values()
+            frames = self.of_frames(state, x, z, weights, factor).values()
+            return Arrow(normal_equations(list(frames)), len(z),
+                         normal_equations([Residual(r.values[None], r.jacobian[None]) for r in shared]))
 
-        # with 1e-3 in the stages before the last, the triangles under the markers depended on how the world was turned
+        # tolerance 1e-4: with 1e-3 before the last stage, the triangles depended on the orientation of the world
         end = levenberg_marquardt(equations, state.rows, 24 if last else 8, 1e-4, angles=self.n_angles)
         return end.x, bool(end.converged[0]), end.iterations
 
     def of_frames(self, state: LatentState, x: np.ndarray, z: np.ndarray, weights: np.ndarray, factor: float
                   ) -> dict[str, Residual]:
-        """The terms of the frames, derivatives by (x, z)."""
+        """Return the terms of the frames, E_D and E_θ, with derivatives by (x, z)."""
         whole = np.concatenate([x, np.tile(z, (len(x), 1))], axis=1)
         return {"data": marker_term(self.simulate(state, x, z), self.targets, weights),
                 "pose": energy.pose_prior_term(whole, self.prior, factor * self.config.pose)}            # [MoSh] Eq. 21
 
-    def shared_terms(self, state: LatentState, usual: LatentPoints, z: np.ndarray, factor: float) -> dict[str,
-                                                                                                          Residual]:
-        """The terms of what frames share."""
+    def shared_terms(self, state: LatentState, usual: LatentPoints, z: np.ndarray, factor: float
+                     ) -> dict[str, Residual]:
+        """Return the terms that frames share, E_S, E_I and E_β, with derivatives by z."""
         c, markers = self.config, latent_places(state.markers.kind, state.supports, z)
         distances = np.asarray(state.layout.distances)
         return {"surface": surface_term(markers, state.corners.moving(z), state.least, state.greatest, c.surface),
@@ -366,23 +376,24 @@ class LatentFit:
                 "shape": shape_term(z, self.n_betas, factor * c.shape)}
 
     def energies(self, state: LatentState) -> dict[str, float]:
-        """What each term is, weights included."""
+        """Compute the value of each term, weights included."""
         both = self.of_frames(state, state.x, state.z, self.weights(state), 1.0) | self.shared_terms(
             state, self._usual(state.layout), state.z, 1.0)
         return {name: float(np.sum(term.energy)) for name, term in both.items()}
 
     def export_layout(self, state: LatentState) -> MarkerLayout:
-        """The layout with every marker on the triangle it hangs on at its own distance, exact in the latent pose."""
-        vertices, points, hung = self.latent.at(state.betas), state.places, state.markers
-        if hung.kind != "triangle":
-            hung = latent_markers(self.model.template.with_vertices(vertices), points)
-        p = vertices[hung.corners]
-        c = hung.coefficients(vertices, points)
+        """Return the layout with each marker on its triangle, at its own distance, exact in the latent pose."""
+        vertices, points, attached = self.latent.at(state.betas), state.places, state.markers
+        if attached.kind != "triangle":
+            attached = latent_markers(self.model.template.with_vertices(vertices), points)
+        p = vertices[attached.corners]
+        c = attached.coefficients(vertices, points)
+        # barycentric weights from the coefficients along the first edge, across it, and along the normal
         along, across = p[:, 1] - p[:, 0], p[:, 2] - p[:, 0]
         length = np.linalg.norm(along, axis=1)
         first = np.einsum("ld,ld->l", across, along) / length
         height = np.sqrt(np.einsum("ld,ld->l", across, across) - first**2)
         third = c[:, 1] / height
         second = (c[:, 0] - third * first) / length
-        return MarkerLayout(self.layout.labels, hung.corners, c[:, 2],
+        return MarkerLayout(self.layout.labels, attached.corners, c[:, 2],
                             np.stack([1 - second - third, second, third], axis=1), self.layout.aliases)

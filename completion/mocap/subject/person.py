@@ -1,4 +1,4 @@
-"""The first stage of [MoSh]: the shape of a person and where the markers really sit, from some frames."""
+"""Stage one of [MoSh]: find the shape of a person and the true places of the markers, from some frames."""
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
@@ -26,23 +26,23 @@ __all__ = ["PersonConfig", "PersonFit", "find_person"]
 
 @dataclass(frozen=True, eq=False)
 class PersonFit:
-    """The shape of a person and where the markers really sit.
+    """The shape of a person and the true places of the markers.
 
     Attributes
     ----------
-    betas : (k,) float
+    betas : (k,) float, standard deviations
     layout : MarkerLayout
-        Of the markers that were fitted: three vertices of a triangle with weights, and the distance from the skin.
+        Fitted markers: three vertices of a triangle with weights, and the distance from the skin.
     frames : (B, 2) int
-        Number of the sequence and of the frame that were used.
+        Number of the sequence and of the frame, for each frame of the fit.
     poses : (B, J, 3) float, radians
     trans : (B, 3) float, metres
     residuals : (B, L) float, metres
-        Of the markers of `layout`; NaN where one was not seen.
+        Distance of the markers of `layout` from their simulation; NaN where one was not seen.
     moved : (L,) float, metres
-        How far each marker sits from its usual place on this person.
+        Distance of each marker from its usual place on this person.
     energies : {str: float}
-        What each term is at the end.
+        Each term of the energy at the end.
     converged : bool
     iterations : int
     """
@@ -60,40 +60,40 @@ class PersonFit:
 
     @property
     def residual(self) -> float:
-        """The mean distance, metres."""
+        """Mean residual, metres."""
         return float(np.nanmean(self.residuals))
 
     def standing_off(self, usual: MarkerLayout) -> dict[str, float]:
-        """Label -> distance from the skin, metres, of markers that are on wands, or off the bars of a layout."""
+        """Return label -> distance from the skin, metres, for markers on wands, or without the bar of the layout."""
         distances = dict(zip(usual.labels, np.asarray(usual.distances).tolist(), strict=True))
         return {label: float(found) for label, found in
                 zip(self.layout.labels, np.asarray(self.layout.distances), strict=True)
                 if abs(found - distances.get(label, found)) > ON_SKIN}
 
     def metrics(self, usual: MarkerLayout) -> list[Metric]:
-        """A row of the markers whose distance from the skin is another than the layout says."""
+        """Return a row with markers whose distance from the skin differs from the layout's."""
         off = self.standing_off(usual)
         return [Metric(f"not at the layout's distance from the skin ({', '.join(off)})",
                        1000 * float(np.mean(list(off.values()))), "mm")] if off else []
 
     def judgement(self, usual: MarkerLayout) -> Judgement:
-        """What a person is worth by where the markers were found on the body; loose ones may be anywhere."""
+        """Judge the fit by how far markers were moved along the body; loose ones may be anywhere."""
         return judge_moves({label: moved for label, moved in zip(self.layout.labels, self.moved, strict=True)
                             if label not in usual.loose}, len(self.moved))
 
 
 def judge_moves(moves: Mapping[str, float], count: int) -> Judgement:
-    """What a person is worth of whose `count` markers some, label -> metres, were moved along the body.
+    """Judge a person by how far some of its `count` markers were moved along the body, label -> metres.
 
     Examples
     --------
     >>> str(judge_moves({"LTHI": 0.02, "LKNE": 0.18}, 39))
     "check: moved by more than a hand's width: LKNE by 18 cm"
     """
-    # metres: a marker that is moved farther is to be looked at
+    # 0.08: metres, a hand's width; a marker that is moved farther is a doubt
     far = [f"{label} by {100 * moved:.0f} cm" for label, moved in moves.items() if moved > 0.08]
-    # share from which on the result means nothing; on 4 recordings of actors, 5 of clinics and 16 of other places
-    # it is at most 0.1
+    # 0.25: share of the markers beyond which the result means nothing; at most 0.1 on 4 recordings of actors, 5 of
+    # clinics and 16 of other places
     if len(far) > 0.25 * count:
         return Judgement.of(f"{len(far)} of {count} markers moved by more than a hand's width: another layout, or the "
                             "labels of other places?")
@@ -104,29 +104,48 @@ def judge_moves(moves: Mapping[str, float], count: int) -> Judgement:
 def find_person(model: BodyModel, sequences: MarkerSequence | Sequence[MarkerSequence], layout: MarkerLayout,
                 config: PersonConfig | None = None, progress: Progress | None = None, step: Step = run_uncached
                 ) -> PersonFit:
-    """The betas of a person and the places of the markers on the skin, from some frames of one or more sequences.
+    """Find the betas of a person and the places of the markers on the skin, from some frames of its sequences.
 
-    Betas, latent markers and the pose and place in each frame are solved for together, at first held close to the
-    mean person, usual places and usual poses, then less and less. The mesh is built between the stages only, to hang
-    markers that have moved on the triangles to which they are nearest now.
+    Betas, latent markers, and the pose and place in each frame are solved for together. At first they are held close to
+    the mean person, usual places and usual poses, then less and less. The mesh is built only between the stages, to
+    attach moved markers to the triangles that are nearest now.
 
     Parameters
     ----------
     model : BodyModel
+        With betas.
     sequences : MarkerSequence, or several of one subject
+        Markers in metres.
     layout : MarkerLayout
         Where markers usually sit on the model's template. Markers that are in no sequence are left out.
     config : PersonConfig, optional
+        Settings.
     progress : callable, optional
         Called with (done, total).
     step : callable, optional
-        Keeps what leads to the person, as `TaskContext.step` does.
+        Keeps intermediate results, as `TaskContext.step` does.
+
+    Returns
+    -------
+    PersonFit
+        Betas (k,), the layout on this person, and poses (B, J, 3) in radians of the frames that were used.
 
     Raises
     ------
     ValueError
         A model without betas, no sequence, fewer than 3 markers in common, no frame with 3 of them, a layout of
         another body, no stage of annealing.
+
+    Examples
+    --------
+    >>> from completion import load_layout
+    >>> from model import load_built_in_model
+    >>> model = load_built_in_model()
+    >>> layout = load_layout("cmu41", model.template, np.array(model.info["people_vertices"]))
+    >>> walk = MarkerSequence(np.stack([layout.place(model.template)] * 3), layout.labels, 120.0)
+    >>> quick = PersonConfig(frames=2, n_betas=3, annealing=(10.0, 1.0))
+    >>> find_person(model, walk, layout, quick).betas.shape
+    (3,)
 
     [MoSh] Eq. 23
     """
@@ -135,25 +154,27 @@ def find_person(model: BodyModel, sequences: MarkerSequence | Sequence[MarkerSeq
         raise ValueError("model: expected one with betas, this one knows its template's body only")
     if not config.annealing:
         raise ValueError("annealing: expected at least one factor, got none")
+    # markers of the layout, and the frames to use
     known, positions = common_markers(sequences, layout)
     chosen, stages = choose_frames(positions, config), len(config.annealing)
     targets, tell = np.concatenate(positions)[chosen], progress or (lambda done, total: None)
-    total, given = len(chosen) + stages, (model, known, targets, config)
+    total, inputs = len(chosen) + stages, (model, known, targets, config)
 
     # the poses of the mean person in these frames, then everything together, stage by stage
     mean = mean_person(model.subject(np.zeros(min(config.n_betas, model.n_betas))), known)
-    x = step("person, start", given, lambda: start_frames(mean, targets, lambda done: tell(done, total)))
+    x = step("person, start", inputs, lambda: start_frames(mean, targets, lambda done: tell(done, total)))
     fit = LatentFit(model, known, targets, config)                                          # [MoSh] Eq. 15
     state, steps, converged = fit.start(x), 0, False
     for i, factor in enumerate(config.annealing):
         last = i == stages - 1
         if i % 2 or (last and i):                        # loose markers are looked for before two of the stages
             state = fit.reattach(state, i in (1, 3), last)                                 # [MoSh] Eq. 16
-        rows, converged, taken = step(f"person, stage {i}", given,
+        rows, converged, taken = step(f"person, stage {i}", inputs,
                                       partial(fit.solve, state, factor, last))              # [MoSh] Eq. 23
         state, steps = state.with_unknowns(rows), steps + taken
         tell(len(chosen) + i + 1, total)
 
+    # number frames within their sequence, and collect the result
     ends, (pose, trans) = np.cumsum([len(each) for each in positions]), fit.split(state.x)
     which = np.searchsorted(ends, chosen, side="right")
     moved = np.linalg.norm(state.places - fit.usual_places(fit.layout, state.betas), axis=1)
@@ -163,7 +184,7 @@ def find_person(model: BodyModel, sequences: MarkerSequence | Sequence[MarkerSeq
 
 
 def one_or_more(sequences: MarkerSequence | Sequence[MarkerSequence]) -> list[MarkerSequence]:
-    """The sequences as a list; ValueError where there is none."""
+    """Return the sequences as a list; ValueError where there is none."""
     found = [sequences] if isinstance(sequences, MarkerSequence) else list(sequences)
     if not found:
         raise ValueError("sequences: expected at least one, got none")
@@ -172,19 +193,19 @@ def one_or_more(sequences: MarkerSequence | Sequence[MarkerSequence]) -> list[Ma
 
 def common_markers(sequences: Sequence[MarkerSequence], layout: MarkerLayout
                    ) -> tuple[MarkerLayout, list[np.ndarray]]:
-    """The part of a layout that is in any of the sequences, and its markers (T, L, 3) in each, NaN if it lacks one."""
+    """Return the part of a layout that is in any sequence, and its markers (T, L, 3) in each, NaN if one is missing."""
     columns = [{layout.aliases.get(label, label): sequence.labels.index(label)
                 for label in layout.match_labels(sequence.labels)} for sequence in sequences]
-    known = layout.without([label for label in layout.labels if not any(label in mine for mine in columns)])
+    known = layout.without([label for label in layout.labels if not any(label in column_of for column_of in columns)])
     positions = [np.full((len(sequence.positions), len(known.labels), 3), np.nan) for sequence in sequences]
-    for out, sequence, mine in zip(positions, sequences, columns, strict=True):
-        rows = [i for i, label in enumerate(known.labels) if label in mine]
-        out[:, rows] = sequence.positions[:, [mine[known.labels[i]] for i in rows]]
+    for out, sequence, column_of in zip(positions, sequences, columns, strict=True):
+        rows = [i for i, label in enumerate(known.labels) if label in column_of]
+        out[:, rows] = sequence.positions[:, [column_of[known.labels[i]] for i in rows]]
     return known, positions
 
 
 def choose_frames(positions: Sequence[np.ndarray], config: PersonConfig) -> np.ndarray:
-    """Frames (B,) to use, counted through all sequences (T, L, 3): well seen ones that differ most, or random ones."""
+    """Choose well-seen frames (B,), counted through all sequences (T, L, 3): those that differ most, or random ones."""
     if config.choice not in ("spread", "random"):
         raise ValueError(f"choice: expected spread or random, got {config.choice!r}")
     together = np.concatenate(positions)
@@ -192,7 +213,7 @@ def choose_frames(positions: Sequence[np.ndarray], config: PersonConfig) -> np.n
     if seen.max(initial=0) < 3:
         raise ValueError(f"sequences: expected a frame with at least 3 known markers, the best has "
                          f"{seen.max(initial=0)}")
-    # of the most markers that any frame has; frames with fewer are not used
+    # 0.9: frames with fewer than that share of the most markers of any frame are not used
     good = np.flatnonzero(seen >= max(3, 0.9 * seen.max()))
     if config.choice == "random":
         rng = np.random.default_rng(config.seed)
@@ -201,11 +222,12 @@ def choose_frames(positions: Sequence[np.ndarray], config: PersonConfig) -> np.n
 
 
 def spread_frames(positions: np.ndarray, count: int) -> np.ndarray:
-    """Frames (B,) in which markers (T, L, 3) stand to each other in many ways, by the distances between them."""
-    some = spread_indices(len(positions), 400)
+    """Choose frames (B,) in which the distances between markers (T, L, 3) differ most."""
+    candidates = spread_indices(len(positions), 400)
     first, second = np.triu_indices(positions.shape[1], 1)
-    apart = np.linalg.norm(positions[some][:, first] - positions[some][:, second], axis=2)
+    apart = np.linalg.norm(positions[candidates][:, first] - positions[candidates][:, second], axis=2)
+    # a missing distance counts as the mean one
     there = ~np.isnan(apart)
     middle = np.where(there, apart, 0).sum(axis=0) / np.maximum(there.sum(axis=0), 1)
     apart = np.where(there, apart - middle, 0)
-    return some[np.sort(farthest_points(apart, count, np.argmin((apart**2).sum(axis=1))))]
+    return candidates[np.sort(farthest_points(apart, count, np.argmin((apart**2).sum(axis=1))))]

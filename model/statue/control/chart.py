@@ -1,4 +1,4 @@
-"""One flat chart of a control mesh: the seams along which it is cut, and where every triangle lies in an image."""
+"""The texture chart of a control mesh: the seams along which it is cut, and the flattening into an image."""
 from __future__ import annotations
 
 from collections.abc import Sequence
@@ -18,8 +18,9 @@ from scanprep.words import number_of
 
 
 def find_seams(mesh: Mesh, skeleton: Skeleton) -> list[np.ndarray]:
-    """A tree of seams, each the vertices (k,) that it passes, to the tips of all limbs, rather where the surface is
-    hidden. Each tip in turn, the nearest first, is joined to the seams there are by the shortest path over the edges.
+    """Find a tree of seams to the tips of all limbs, preferably where the surface is hidden.
+
+    Each seam is its vertices (k,). The tips, nearest first, are joined to the tree by the cheapest path over the edges.
     """
     graph = _costs(mesh)
     first, *rest = limb_tips(mesh, skeleton)
@@ -37,7 +38,7 @@ def find_seams(mesh: Mesh, skeleton: Skeleton) -> list[np.ndarray]:
 
 
 def join(graph: csr_array, tree: np.ndarray, goal: int) -> np.ndarray:
-    """The cheapest path (k,) over a graph from any vertex of `tree` to `goal`."""
+    """Find the cheapest path (k,) over a graph from any vertex of `tree` to `goal`."""
     before = dijkstra(graph, directed=False, indices=tree, min_only=True, return_predecessors=True)[1]
     path = [goal]
     while before[path[-1]] >= 0:
@@ -46,7 +47,7 @@ def join(graph: csr_array, tree: np.ndarray, goal: int) -> np.ndarray:
 
 
 def limb_tips(mesh: Mesh, skeleton: Skeleton) -> list[int]:
-    """One vertex for each part without children, and for the root when it has only one."""
+    """Find the tips of limbs: one vertex for each part without children, and for the root with only one child."""
     x, y = mesh.edges.T
     graph = coo_array((mesh.edge_lengths, (x, y)), shape=2 * (len(mesh.vertices),)).tocsr()
     part, parents = skeleton.part_of_vertex(mesh), skeleton.parents
@@ -55,22 +56,23 @@ def limb_tips(mesh: Mesh, skeleton: Skeleton) -> list[int]:
         children = np.flatnonzero(parents == p)
         if len(children) > (1 if p == 0 else 0):
             continue
-        mine = np.flatnonzero(part == p)
-        if not len(mine):
+        own = np.flatnonzero(part == p)
+        if not len(own):
             continue
         joint = int(children[0]) if p == 0 and len(children) else p   # where it meets its neighbour
-        start = skeleton.ring(mesh, joint) if joint else mine[:0]
+        start = skeleton.ring(mesh, joint) if joint else own[:0]
         if not len(start):
-            start = mine[[np.linalg.norm(mesh.vertices[mine] - skeleton.joints[joint], axis=1).argmin()]]
+            start = own[[np.linalg.norm(mesh.vertices[own] - skeleton.joints[joint], axis=1).argmin()]]
         far = dijkstra(graph, directed=False, indices=start, min_only=True)
-        tips.append(int(mine[far[mine].argmax()]))
+        tips.append(int(own[far[own].argmax()]))
     return sorted(set(tips))
 
 
 def cut(mesh: Mesh, seams: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-    """Triangles (F, 3) of a closed mesh opened along seams, and the vertex (M,) that each of the new ones was."""
+    """Cut a closed mesh along seams: return triangles (F, 3) and the old vertex (M,) of each new one."""
     if not mesh.is_closed:
         raise ValueError("mesh: expected a closed surface")
+    # edges of the seams are open; corners joined across the other edges become one vertex
     number = {edge: k for k, edge in enumerate(map(tuple, mesh.edges.tolist()))}
     is_open = np.zeros(len(mesh.edges), dtype=bool)
     for seam in seams:
@@ -86,8 +88,9 @@ def cut(mesh: Mesh, seams: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray
 
 
 def _costs(mesh: Mesh) -> csr_array:
-    """Lengths of the edges, those in sight counted longer."""
-    k = np.arange(48) + 0.5                                          # evenly over the sphere
+    """Build a graph of edge lengths in which visible edges are up to twice as long."""
+    # visibility of each vertex: the share of 48 directions, evenly over the sphere, that nothing occludes
+    k = np.arange(48) + 0.5
     z, turn = 1 - 2 * k / 48, np.pi * (1 + 5**0.5) * k
     directions = np.stack([np.sqrt(1 - z * z) * np.cos(turn), np.sqrt(1 - z * z) * np.sin(turn), z], axis=1)
     cosine = np.maximum(mesh.vertex_normals @ directions.T, 0)
@@ -114,7 +117,11 @@ class Chart:
         return Mesh(np.column_stack([self.uv, np.zeros(len(self.uv))]), self.faces)
 
     def texels(self, size: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """Rows (0 above), columns, faces (n,), bary (n, 3) of the pixels whose centres lie in it. [Statues] Eq. 21"""
+        """Find the pixels whose centres lie in the chart: rows (0 on top), columns, faces (n,), barycentric (n, 3).
+
+        [Statues] Eq. 21
+        """
+        # the bounding box of every triangle in pixels, and the barycentric coordinates of all pixels in it
         corners = self.uv[self.faces] * size - 0.5                     # pixel centres have whole numbers here
         low = np.maximum(np.ceil(corners.min(axis=1)).astype(np.int64), 0)
         count = np.maximum(np.minimum(np.floor(corners.max(axis=1)).astype(np.int64), size - 1) - low + 1, 0)
@@ -131,7 +138,7 @@ class Chart:
 
 
 def make_chart(mesh: Mesh, seams: Sequence[np.ndarray]) -> Chart:
-    """A closed mesh cut along seams, a tree that must leave one disk, and laid flat in the unit square."""
+    """Cut a closed mesh along a tree of seams into one disk, and flatten it into the unit square."""
     faces, corner = cut(mesh, seams)
     disk = Mesh(mesh.vertices[corner], faces)
     euler = len(disk.vertices) - len(disk.edges) + len(disk.faces)
@@ -139,7 +146,8 @@ def make_chart(mesh: Mesh, seams: Sequence[np.ndarray]) -> Chart:
         raise ValueError(f"seams: expected a tree of edges that cuts the mesh into one disk, got "
                          f"{disk.vertex_component.max() + 1} pieces with Euler number {euler}")
     uv = flatten(disk)
-    # turned and scaled so that the smallest square around it is the unit square, six pixels of 1,024 left free
+    # rotate by the angle with the smallest bounding square and scale that to the unit square, with a margin of six of
+    # 1,024 pixels
     angles = np.radians(np.arange(0, 90, 0.5))
     cos, sin = np.cos(angles), np.sin(angles)
     places = np.einsum("ija,nj->ani", np.array([[cos, -sin], [sin, cos]]), uv)
@@ -153,18 +161,18 @@ def make_chart(mesh: Mesh, seams: Sequence[np.ndarray]) -> Chart:
 
 
 def automatic_chart(mesh: Mesh, skeleton: Skeleton, rounds: int = 4) -> Chart:
-    """A chart whose seams go on to where it is crowded, such as the tips of fingers; `rounds` charts at most."""
+    """Make a chart and extend its seams to crowded regions, such as fingertips; at most `rounds` charts are made."""
     seams, graph = find_seams(mesh, skeleton), _costs(mesh)
     chart = make_chart(mesh, seams)
     for _ in range(rounds - 1):
-        # a seam more to the smallest triangle of every region that is drawn smaller than a third of the mean, in length
+        # another seam to the smallest triangle of every region that is scaled below a third of the mean, in length
         density, longer = densities(mesh, chart), list(seams)
         crowded = np.flatnonzero(density < 1 / 3)
         region = mesh.submesh(crowded)[0]
         region_of = region.vertex_component[region.faces[:, 0]]
         for k in np.unique(region_of):
-            mine = crowded[region_of == k]
-            seam = join(graph, np.unique(np.concatenate(longer)), int(mesh.faces[mine[density[mine].argmin()], 0]))
+            own = crowded[region_of == k]
+            seam = join(graph, np.unique(np.concatenate(longer)), int(mesh.faces[own[density[own].argmin()], 0]))
             longer += [seam] if len(seam) > 1 else []
         if len(longer) == len(seams):
             break
@@ -173,16 +181,16 @@ def automatic_chart(mesh: Mesh, skeleton: Skeleton, rounds: int = 4) -> Chart:
 
 
 def densities(mesh: Mesh, chart: Chart) -> np.ndarray:
-    """(F,) how large each triangle is drawn against the mean of the surface, in length."""
+    """Compute the scale (F,) of each triangle in the chart relative to the mean, in length."""
     drawn = _twice_area(*chart.uv[chart.faces].swapaxes(0, 1)) / 2
     return np.sqrt(drawn / mesh.face_areas * mesh.face_areas.sum() / drawn.sum())
 
 
 def flatten(mesh: Mesh) -> np.ndarray:
-    """Places in the plane (N, 2) of a surface with one border, scaled to its area, one-to-one.
+    """Flatten a surface with one border into the plane, (N, 2), one-to-one and with its area.
 
-    From an embedding of Tutte on, libigl's SLIM lowers the symmetric Dirichlet energy. Its steps invert no triangle;
-    each goes only so far that the border does not cross itself.
+    From Tutte's embedding, libigl's SLIM lowers the symmetric Dirichlet energy. Its steps invert no triangle, and are
+    halved until the border does not cross itself.
     """
     import igl
 
@@ -208,8 +216,9 @@ def flatten(mesh: Mesh) -> np.ndarray:
 
 
 def chart_problem(mesh: Mesh, chart: Chart) -> str | None:
-    """Why a chart cannot carry the images of a mesh, or None when it can: it is one disk inside the unit square, no
-    triangle inverted, whose border does not meet itself, so one-to-one.
+    """Explain why a chart cannot carry the images of a mesh; None where it can.
+
+    A usable chart is one disk inside the unit square, without inverted triangles, whose border does not meet itself.
     """
     if chart.faces.shape != mesh.faces.shape:
         return f"it has {len(chart.faces)} triangles, the mesh {len(mesh.faces)}"
@@ -231,18 +240,18 @@ def chart_problem(mesh: Mesh, chart: Chart) -> str | None:
 
 
 def _twice_area(a: np.ndarray, b: np.ndarray, c: np.ndarray) -> np.ndarray:
-    """Twice the signed area (n,) of triangles in the plane."""
+    """Compute twice the signed area (n,) of triangles in the plane."""
     return (b[:, 0] - a[:, 0]) * (c[:, 1] - a[:, 1]) - (b[:, 1] - a[:, 1]) * (c[:, 0] - a[:, 0])
 
 
 def planar_barycentric(points: np.ndarray, a: np.ndarray, b: np.ndarray, c: np.ndarray) -> np.ndarray:
-    """(n, 3) where points lie in triangles of the plane, negative outside."""
+    """Compute barycentric coordinates (n, 3) of points in triangles of the plane; negative outside."""
     parts = np.stack([_twice_area(points, b, c), _twice_area(points, c, a), _twice_area(points, a, b)], axis=1)
     return parts / _twice_area(a, b, c)[:, None]
 
 
 def crossings(loop: np.ndarray) -> bool:
-    """Whether a closed polygon (n, 2) meets itself other than where its sides follow each other, exactly."""
+    """Return whether a closed polygon (n, 2) meets itself other than at the ends of successive sides, exactly."""
     a, b = loop, np.roll(loop, -1, axis=0)
     n = len(loop)
     low, high = np.minimum(a, b), np.maximum(a, b)
@@ -250,18 +259,19 @@ def crossings(loop: np.ndarray) -> bool:
     i, j = np.nonzero(np.triu(near, 2))
     apart = (j - i) % n != n - 1
     i, j = i[apart], j[apart]
-    for _ in range(2):              # sides whose ends do not lie on one side of the other's line, both ways round
+    for _ in range(2):              # two sides cross if each has its ends on both sides of the other's line
         met = orientation(a[i], b[i], a[j]) * orientation(a[i], b[i], b[j]) <= 0
         i, j = j[met], i[met]
     return bool(len(i))
 
 
 def orientation(a: np.ndarray, b: np.ndarray, c: np.ndarray) -> np.ndarray:
-    """(n,) the exact sign of the area of triangles in the plane: 1 counter-clockwise, 0 without area, -1 clockwise."""
+    """Compute the exact orientation (n,) of triangles in the plane: 1 counter-clockwise, 0 without area, -1 clockwise.
+    """
     first = (b[:, 0] - a[:, 0]) * (c[:, 1] - a[:, 1])
     second = (b[:, 1] - a[:, 1]) * (c[:, 0] - a[:, 0])
     sign = np.sign(first - second).astype(int)
-    # else the sign is worked out in fractions
+    # where rounding could change the sign, it is computed with fractions
     for k in np.flatnonzero(np.abs(first - second) <= 1e-15 * (np.abs(first) + np.abs(second))):
         (ax, ay), (bx, by), (cx, cy) = (map(Fraction, map(float, p[k])) for p in (a, b, c))
         area = (bx - ax) * (cy - ay) - (by - ay) * (cx - ax)

@@ -24,11 +24,11 @@ STORED = Path(__file__).with_name("humanoid.npz")           # made by tests/huma
 
 
 def read_control(path: str | Path) -> ControlModel:
-    """A control model: a file of `write_control`, or a skinned mesh in a GLB file as Blender exports it.
+    """Read a control model: a file of `write_control`, or a skinned mesh in a GLB file as Blender exports it.
 
-    Of a skinned mesh the pose of the file is the default pose, turned so that z is up; joints turn about three axes
-    with wide limits, every part is a segment of its own, and there are no landmarks. Joints that carry no triangle are
-    left out; without texture coordinates a chart is made. StorageError says what is wrong with a file.
+    For a skinned mesh, the pose of the file is the default pose, turned so that z is up. Joints rotate about three axes
+    with wide limits, every part is a segment of its own, and there are no landmarks. Joints without triangles are left
+    out. Without texture coordinates a chart is made. StorageError says what is wrong with a file.
     """
     readers = {".npz": _load, ".glb": _read_skinned}
     if Path(path).suffix.lower() not in readers:
@@ -50,7 +50,7 @@ def write_control(control: ControlModel, path: str | Path) -> None:
 
 
 def _load(path: Path) -> ControlModel:
-    """A file of `write_control`."""
+    """Read a file of `write_control`."""
     header, arrays = storage.load(path, KIND, (VERSION,))
     with storage.taking_apart(path, "a whole control model"):
         freedom = storage.numbers(arrays, "freedom", None, kinds="iu")
@@ -112,8 +112,9 @@ def _read_skinned(path: Path) -> ControlModel:
 
 def _corners(tree: dict[str, Any], binary: bytes, mesh: dict[str, Any], joints: int
              ) -> tuple[np.ndarray, np.ndarray, np.ndarray | None, np.ndarray]:
-    """Points (n, 3), weights (n, joints), texture coordinates (n, 2) and triangles of all primitives of a mesh, one
-    after the other: materials do not part a control mesh. Points come again where normals or texture coordinates part.
+    """Join all primitives of a mesh: points (n, 3), weights (n, joints), texture coordinates (n, 2) and triangles.
+
+    Materials do not divide a control mesh. Points are repeated where normals or texture coordinates differ.
     """
     points, weights, uv, faces, start = [], [], [], [], 0
     for primitive in mesh["primitives"]:
@@ -160,11 +161,12 @@ def _control(surface: tuple[Mesh, np.ndarray, Chart | None], places: np.ndarray,
 
 def _weld(points: np.ndarray, weights: np.ndarray, uv: np.ndarray | None, corners: np.ndarray
           ) -> tuple[Mesh, np.ndarray, Chart | None]:
-    """Mesh, weights and chart with one vertex at every place."""
+    """Weld repeated points: mesh, weights and chart with one vertex at every place."""
     _, first, place = np.unique(points.astype(np.float32), axis=0, return_index=True, return_inverse=True)
     order = np.argsort(np.argsort(first))                              # vertices in the order of the file
     first, place = np.sort(first), order[place.reshape(-1)]
     faces = place[corners]
+    # triangles that collapse by welding, and unused vertices, are dropped
     whole = (faces != np.roll(faces, 1, axis=1)).all(axis=1)
     faces, at_corners = faces[whole], corners[whole]
     used, number = np.unique(faces, return_inverse=True)
@@ -180,9 +182,10 @@ def _weld(points: np.ndarray, weights: np.ndarray, uv: np.ndarray | None, corner
 
 def _with_triangles(mesh: Mesh, weights: np.ndarray, parents: np.ndarray
                     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """The joints (k,) that carry some triangle more than any other does, parents first; their parents, weights (N, k)
-    and the part of every triangle. What the others carry goes to the next one above; where more than one tree is left,
-    all hang on the one with most triangles.
+    """Keep the joints (k,) that have the largest weight on some triangle, parents first.
+
+    Returns them with their parents, weights (N, k), and the part of every triangle. Weights of the other joints go to
+    the next kept joint above. Where several trees are left, all are attached to the one with most triangles.
     """
     carrier = weights[mesh.faces].mean(axis=1).argmax(axis=1)
     size = np.bincount(carrier, minlength=len(parents))

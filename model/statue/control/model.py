@@ -1,4 +1,4 @@
-"""What a statue is made of: control model (a mesh on a skeleton, with one chart for images) and displacement map."""
+"""The data of a statue: control model (a mesh on a skeleton, with one texture chart) and displacement map."""
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
@@ -25,8 +25,9 @@ class ControlModel:
     skeleton : Skeleton
         Part 0 is the root; `joints` are the joint centres in the default pose.
     weights : (N, J) float
-        How much each part carries each vertex; rows sum to 1, at most four are not zero.
+        Blend weights; rows sum to 1, at most four are not zero.
     chart : Chart
+        Texture coordinates for all images.
     landmarks : {name: vertex}
         Feature points of the surface, named as in the synthetic people.
     axes : J arrays (k, 3), unit
@@ -58,12 +59,12 @@ class ControlModel:
         return Rig(self.mesh, self.skeleton, self.weights, np.zeros((0, *self.mesh.vertices.shape)))
 
     def refit(self, vertices: np.ndarray, joints: np.ndarray) -> ControlModel:
-        """The same model on other vertices (N, 3) and joint centres (J, 3), whose pose becomes the default pose."""
+        """Replace vertices (N, 3) and joint centres (J, 3); their pose becomes the default pose."""
         return replace(self, mesh=self.mesh.with_vertices(vertices), skeleton=replace(self.skeleton, joints=joints))
 
 
 def control_problem(control: ControlModel) -> str | None:
-    """Why a control model is not usable, or None when it is."""
+    """Explain why a control model is not usable; None where it is."""
     mesh, J, N = control.mesh, len(control.skeleton.parents), len(control.mesh.vertices)
     problem = surface_problem(mesh) or chart_problem(mesh, control.chart)
     if problem:
@@ -87,7 +88,7 @@ def control_problem(control: ControlModel) -> str | None:
 
 
 def surface_problem(mesh: Mesh) -> str | None:
-    """Why a mesh cannot be a control mesh, or None when it can."""
+    """Explain why a mesh cannot be a control mesh; None where it can."""
     problem = template_problem(mesh)
     if problem is None and not mesh.is_closed:
         problem = f"it is open: {(mesh.edge_use == 1).sum()} edges have one triangle only, expected a closed surface"
@@ -120,17 +121,29 @@ class DisplacementMap:
 
 @dataclass(frozen=True, eq=False)
 class Statue:
-    """One person as control model, displacement map and texture.
+    """One person as control model, displacement map and texture; made by `fit_statue`.
 
     Attributes
     ----------
     control : ControlModel
-        Fitted: its default pose is that of the scan.
+        The fitted control model; its default pose is that of the scan.
     pose : (J, 3) float, radians
-        How the generic model's parts were rotated from its default pose to that of the scan.
+        Rotations of the generic model's parts from its default pose to that of the scan.
     map : DisplacementMap
+        The detail of the scan over the control mesh.
     texture : (H, W, 3) uint8, optional
         Colours over the same chart.
+
+    Examples
+    --------
+    A statue of the generic humanoid itself, with a flat map:
+
+    >>> from model.statue.control.files import humanoid
+    >>> flat = DisplacementMap(np.zeros((16, 16), np.float32), np.full((16, 16), MEASURED, np.uint8))
+    >>> Statue(humanoid(), np.zeros((len(humanoid().skeleton.parents), 3)), flat).upright_axis
+    2
+
+    [Statues]
     """
 
     control: ControlModel

@@ -1,7 +1,7 @@
 """The displacement map of a scan over a control model, and where the scan is not one-to-one with it [Statues].
 
-Every pixel's height is where the interpolated normal there crosses the scan: Eq. 19 at the pixel itself. The paper
-solves it at the scan's vertices and interpolates, which is the same where the scan's triangles are small.
+The height of a pixel is where the interpolated normal crosses the scan: Eq. 19 at the pixel itself. The paper solves it
+at the scan's vertices and interpolates, which is the same where the scan's triangles are small.
 """
 from __future__ import annotations
 
@@ -25,12 +25,12 @@ from ..control.model import FOLDED, HOLE, MEASURED, OUTSIDE, ControlModel, Displ
 from .normal_volume import Crossings, find_crossings, interpolate, limits, not_inverted, outer_layers
 from .texels import Lattice, Texels, find_texels
 
-SPACING = 0.002                      # metres between the places of the scan that draw the surface over folds
+SPACING = 0.002                      # metres between the scan points that attract the surface over folds
 
 
 @dataclass(frozen=True)
 class DisplacementConfig(Settings):
-    """Settings of `bake`.
+    """Settings of `bake_displacement`.
 
     Attributes
     ----------
@@ -49,7 +49,7 @@ class DisplacementConfig(Settings):
 
 def bake_displacement(control: ControlModel, scan: Mesh, config: DisplacementConfig | None = None,
                       progress: Progress | None = None) -> DisplacementMap:
-    """The displacement map of a scan over a control model that has been fitted to it.
+    """Compute the displacement map of a scan over a control model that has been fitted to it.
 
     ValueError for a scan without triangles, or a chart that covers no pixel.
 
@@ -57,22 +57,22 @@ def bake_displacement(control: ControlModel, scan: Mesh, config: DisplacementCon
     """
     config, tell = config or DisplacementConfig(), progress or (lambda done, total: None)
     ready = ReadyScan(scan)
-    found = find_heights(control, ready, config)
+    result = find_heights(control, ready, config)
     tell(1, 2)
-    texels, heights = found.texels, found.heights
-    coverage = np.where(found.folded, FOLDED, np.where(found.known, MEASURED, HOLE)).astype(np.uint8)
+    texels, heights = result.texels, result.heights
+    coverage = np.where(result.folded, FOLDED, np.where(result.known, MEASURED, HOLE)).astype(np.uint8)
     coverage[~texels.inside] = OUTSIDE
     vectors = None
     if config.vectors:                           # what is to be added to the heights in and around folds
         lattice = Lattice(control, 4)
-        drawn, u = bend_over_folds(lattice, ready, found, config.reach)
+        drawn, u = bend_over_folds(lattice, ready, result, config.reach)
         near = np.unique(lattice.subdivision.face_parent[drawn[lattice.fine.faces].any(axis=1)])
         which = np.flatnonzero(np.isin(texels.faces, near))
         which = which[lattice.sample(drawn.astype(float), texels.faces[which], texels.bary[which]) > 0]
         faces, bary = texels.faces[which], texels.bary[which]
         more = np.zeros((len(heights), 3))
         more[which] = (lattice.sample(u, faces, bary)
-                       - found.heights[which, None] * interpolate(control.mesh, faces, bary)[1])
+                       - result.heights[which, None] * interpolate(control.mesh, faces, bary)[1])
         vectors = texels.image(more.astype(np.float32))
     tell(2, 2)
     return DisplacementMap(texels.image(heights.astype(np.float32)), texels.image(coverage, OUTSIDE), vectors)
@@ -80,7 +80,7 @@ def bake_displacement(control: ControlModel, scan: Mesh, config: DisplacementCon
 
 @dataclass(frozen=True, eq=False)
 class ReadyScan:
-    """A scan, and what is asked of it again and again."""
+    """A scan with its ray caster and its search tree, each built once."""
 
     mesh: Mesh
 
@@ -104,7 +104,7 @@ class Heights:
 
 
 def find_heights(control: ControlModel, scan: ReadyScan, config: DisplacementConfig) -> Heights:
-    """Measured, sorted and filled heights; arguments and errors as of `bake`."""
+    """Measure, classify and fill the heights; arguments and errors as of `bake_displacement`."""
     import igl
 
     if not len(scan.mesh.faces):
@@ -112,26 +112,26 @@ def find_heights(control: ControlModel, scan: ReadyScan, config: DisplacementCon
     mesh, reach, texels = control.mesh, config.reach, find_texels(control.mesh, control.chart, config.size)
     if not texels.inside.any():
         raise ValueError(f"size: {config.size} pixels are too few, no pixel's centre lies in the chart")
-    # crossings of each pixel's normal with the scan that no other body part and no inverted triangle rules out
+    # 1. crossings of each pixel's normal with the scan, without other body parts and inverted triangles
     points, normals = interpolate(mesh, texels.faces, texels.bary)
-    found = outer_layers(find_crossings(scan.mesh, scan.rays, points, normals, reach))
+    met = outer_layers(find_crossings(scan.mesh, scan.rays, points, normals, reach))
     low, high = limits(mesh, points, normals, reach)
-    of = found.normal
-    far = found.heights * np.linalg.norm(normals[of], axis=1)
-    found = found.pick((found.cosines > 0.1) & (far >= low[of]) & (far <= high[of])
-                       & not_inverted(mesh, texels.faces[of], texels.bary[of], found.heights))
-    several = np.bincount(found.normal, minlength=len(points)) > 1
-    heights = _choose(found, several, texels.neighbours())
+    owner = met.normal
+    far = met.heights * np.linalg.norm(normals[owner], axis=1)
+    met = met.pick((met.cosines > 0.1) & (far >= low[owner]) & (far <= high[owner])
+                       & not_inverted(mesh, texels.faces[owner], texels.bary[owner], met.heights))
+    several = np.bincount(met.normal, minlength=len(points)) > 1
+    heights = _choose(met, several, texels.neighbours())
     known, folded = _sort(control, texels, heights, several)
-    # Without a height: a place inside the scan, however deep, is a fold; outside the surface is missing unless it
-    # passes close by. It is missing too where the scan ends at what is nearest, or that is another body part.
+    # 2. pixels without a height: inside the scan they are folds; outside they are holes, unless the surface is near.
+    # They are holes too where the nearest surface is a border of the scan or out of reach.
     empty = np.flatnonzero(~known & ~folded)
     if len(empty):
         nearest = scan.surface.closest(points[empty])
         ends = np.isin(scan.mesh.faces[nearest.faces], scan.mesh.boundary_vertices).any(axis=1)
         inside = np.asarray(igl.fast_winding_number(scan.mesh.vertices, scan.mesh.faces, points[empty])).ravel() > 0.5
         folded[empty] = ~((nearest.distances > reach) | ends | (~inside & (nearest.distances > 0.01)))
-    # filled from around: harmonic on the control surface, so across seams too
+    # 3. fill from around: harmonic on the control surface, so across seams too
     lattice, filled = Lattice(control), heights.copy()
     values, sure = lattice.gather(texels, heights, known)
     values = sparse.harmonic(lattice.fine.vertex_adjacency, values[:, None], sure)[:, 0]
@@ -141,10 +141,10 @@ def find_heights(control: ControlModel, scan: ReadyScan, config: DisplacementCon
 
 def unfold_control(control: ControlModel, scan: Mesh, config: DisplacementConfig | None = None, rounds: int = 2
                    ) -> ControlModel:
-    """A fitted control model whose vertices in folds are moved to where the surface drawn over them lies on the scan.
+    """Open the folds of a fitted control model: move vertices in folds onto the scan.
 
-    Where a fit left the control mesh inside the scan, such as an armpit that it put too high, no height reaches the
-    surface. A round counts only if less of the control mesh than before is folded or a hole.
+    Where the fit left the control mesh inside the scan, as in an armpit that is too high, no height reaches the
+    surface. A round is kept only if less of the control mesh than before is folded or a hole.
     """
     config = config or DisplacementConfig()
     config = replace(config, size=min(config.size, 512))
@@ -165,7 +165,7 @@ def unfold_control(control: ControlModel, scan: Mesh, config: DisplacementConfig
 
 
 def _choose(found: Crossings, several: np.ndarray, pairs: np.ndarray) -> np.ndarray:
-    """Of several crossings that which goes on from the neighbouring pixels, from those with one crossing inwards."""
+    """Choose among several crossings the one that continues the neighbouring pixels, from single crossings inwards."""
     heights = np.full(len(several), np.nan)
     single = ~several[found.normal]
     heights[found.normal[single]] = found.heights[single]
@@ -177,7 +177,7 @@ def _choose(found: Crossings, several: np.ndarray, pairs: np.ndarray) -> np.ndar
         a, b = pairs[usable].T
         count = np.bincount(a, minlength=len(several))
         if not count.any():
-            wanted, ready = np.zeros(len(several)), np.isnan(heights)           # a patch that no single one touches
+            wanted, ready = np.zeros(len(several)), np.isnan(heights)           # a patch without single crossings
         else:
             wanted = np.bincount(a, heights[b], len(several)) / np.maximum(count, 1)
             ready = count > 0
@@ -191,8 +191,10 @@ def _choose(found: Crossings, several: np.ndarray, pairs: np.ndarray) -> np.ndar
 
 def _sort(control: ControlModel, texels: Texels, heights: np.ndarray, several: np.ndarray
           ) -> tuple[np.ndarray, np.ndarray]:
-    """Which pixels (n,) keep their height, and which lie in folds. Neighbours whose heights differ by more than three
-    times their distance are torn apart; less than 1 cm² between such tears is left out and filled.
+    """Classify pixels (n,): which keep their height, and which lie in folds.
+
+    Neighbours whose heights differ by more than three times their distance are torn apart. Patches of less than 1 cm²
+    between such tears are dropped and filled.
     """
     points, _ = interpolate(control.mesh, texels.faces, texels.bary)
     a, b = texels.neighbours().T
@@ -212,17 +214,16 @@ def _sort(control: ControlModel, texels: Texels, heights: np.ndarray, several: n
 
 
 def texel_areas(control: ControlModel, texels: Texels) -> np.ndarray:
-    """(n,) square metres of the control mesh that each pixel stands for."""
+    """Compute the area (n,), square metres, of the control mesh that each pixel covers."""
     pixel = control.chart.flat.face_areas * texels.size**2
     return (control.mesh.face_areas / np.maximum(pixel, 1e-12))[texels.faces]
 
 
 def bend_over_folds(lattice: Lattice, scan: ReadyScan, found: Heights, reach: float) -> tuple[np.ndarray, np.ndarray]:
-    """Which fine vertices (n,) of a lattice are drawn onto the scan, and the displacements (n, 3) of all, metres in the
-    axes of the world.
+    """Bend the surface over folds onto the scan: which fine vertices (n,) moved, and displacements (n, 3) of all, metres.
 
-    Each vertex is drawn to the closest place whose normal agrees, held by the thin-plate energy of its displacement,
-    which is solved for (implicit steps) and made softer from step to step. Around folds it stays where heights say.
+    Each vertex is attracted to the closest scan point with a compatible normal, and held by a thin-plate energy. That
+    is solved by implicit steps and made softer from step to step. Around folds the surface stays where the heights say.
     """
     fine = lattice.fine
     near = fine.vertex_adjacency
@@ -240,7 +241,7 @@ def bend_over_folds(lattice: Lattice, scan: ReadyScan, found: Heights, reach: fl
     places, facing = _places(scan.mesh, start[free], reach)
     if not len(places):
         return drawn, start - p
-    # the thin plate of the free vertices, and what those around pull at them
+    # thin-plate energy of the free vertices, and the pull of the fixed ones around them
     used = np.flatnonzero(drawn[fine.faces].any(axis=1))
     L = csr_array(diags_array(1 / near.sum(axis=1)) @ near - diags_array(np.ones(len(p))))
     held = start.copy()
@@ -262,7 +263,7 @@ def bend_over_folds(lattice: Lattice, scan: ReadyScan, found: Heights, reach: fl
             wanted = np.where(match.valid[:, None], onto, surface[free])
             solver = sparse.Factored(csc_array(stiffness * bending + diags_array(w[:, 0])))
             surface[free] = solver.solve(w * wanted + stiffness * pull)
-    # kept: patches of drawn vertices that have come nearer to the scan, in the mean square
+    # keep only patches that came nearer to the scan, in the mean square
     only = diags_array(drawn.astype(float))
     _, patch = connected_components(only @ near @ only, directed=False)
     faces = fine.faces[drawn[fine.faces].all(axis=1)]
@@ -277,7 +278,7 @@ def bend_over_folds(lattice: Lattice, scan: ReadyScan, found: Heights, reach: fl
 
 
 def _places(scan: Mesh, points: np.ndarray, reach: float) -> tuple[np.ndarray, np.ndarray]:
-    """Places (m, 3) spread over the scan within reach of points, one for a square of SPACING, with normals (m, 3)."""
+    """Sample the scan within reach of points, one point (m, 3) for a square of SPACING, with normals (m, 3)."""
     middle = scan.corners.mean(axis=1)
     far = reach + np.sqrt(((scan.corners[:, 0] - middle)**2).sum(axis=1).max())
     apart, _ = cKDTree(points).query(middle, distance_upper_bound=far, workers=search_threads(len(middle)))
@@ -290,7 +291,7 @@ def _places(scan: Mesh, points: np.ndarray, reach: float) -> tuple[np.ndarray, n
 
 
 def coverage_shares(control: ControlModel, map: DisplacementMap) -> dict[str, float]:
-    """Shares of the control mesh's area that are measured, folded and holes."""
+    """Compute the shares of the control mesh's area that are measured, folded and holes."""
     texels = find_texels(control.mesh, control.chart, len(map.coverage))
     kind, area = map.coverage.ravel()[texels.pixels[texels.inside]], texel_areas(control, texels)[texels.inside]
     return {name: float(area[kind == value].sum() / area.sum())

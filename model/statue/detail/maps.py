@@ -25,7 +25,7 @@ from ..control.model import FOLDED, HOLE, MEASURED, OUTSIDE, DisplacementMap
 
 HEADER, HEIGHTS, IMAGE = "displacement.json", "displacement.tif", "displacement.png"
 COVERAGE, VECTORS = "coverage.png", "vectors.tif"
-ZERO, LARGEST = 32768, 65535
+ZERO, LARGEST = 32768, 65535         # grey values of 16 bits: height 0 in the middle, so that both signs have room
 
 
 def write_map(folder: str | Path, map: DisplacementMap) -> None:
@@ -69,7 +69,7 @@ def read_map(folder: str | Path, edited: str | Path | None = None) -> Displaceme
 
 
 def read_edited(path: str | Path, size: tuple[int, ...]) -> np.ndarray:
-    """(H, W) uint16 grey values of an image that an editor saved: 16 bits of grey, or three equal channels."""
+    """Read grey values (H, W) uint16 of an image that an editor saved: 16 bits of grey, or three equal channels."""
     expected = f"an image of {size[1]} x {size[0]} pixels with 16 bits of grey"
     with taking_apart(path, expected):
         image, depth = _decode_image(Path(path))
@@ -100,7 +100,7 @@ def _write_tiff(path: Path, image: np.ndarray) -> None:
 
 
 def _read(path: Path, size: tuple[int, ...], kind: Any) -> np.ndarray:
-    """A TIFF or PNG image of this shape and kind of numbers, or StorageError."""
+    """Read a TIFF or PNG image of this shape and number type, else StorageError."""
     if path.suffix == ".tif":
         import tifffile
 
@@ -118,7 +118,7 @@ def _read(path: Path, size: tuple[int, ...], kind: Any) -> np.ndarray:
 
 
 def _decode_image(path: Path) -> tuple[np.ndarray, int]:
-    """An image file and its bits per channel."""
+    """Decode an image file; return the pixels and the bits per channel."""
     from PIL import Image
 
     data = read_bytes(path, "an image")

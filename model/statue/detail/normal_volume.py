@@ -1,8 +1,8 @@
-"""Space around a control mesh: a triangle, a place on it and a height along its interpolated normal [Statues].
+"""The normal volume of a control mesh: points as a triangle, a place on it and a height along its normal [Statues].
 
-Normals are interpolated linearly and not made unit length again, as in Eq. 20. Eq. 19 without its place says that a
-point lies in the plane of three corners displaced by d, det[v_r + d n_r - p, v_s + d n_s - p, v_t + d n_t - p] = 0: a
-cubic in d, solved here; the paper's plane parallel to the triangle is exact only where three normals rise alike.
+Normals are interpolated linearly and not normalised again, as in Eq. 20. By Eq. 19 a point p at height d lies in the
+plane of the three displaced corners, det[v_r + d n_r - p, v_s + d n_s - p, v_t + d n_t - p] = 0. That is a cubic in d,
+solved here. The paper's plane parallel to the triangle is exact only where the three normals are parallel.
 """
 from __future__ import annotations
 
@@ -32,20 +32,20 @@ class NormalCoordinates:
 
 
 def interpolate(mesh: Mesh, faces: np.ndarray, bary: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Points (n, 3) of a control mesh and its normals there (n, 3), of length up to 1. [Statues] Eq. 20"""
+    """Interpolate points (n, 3) of a control mesh and its normals there (n, 3), of length up to 1. [Statues] Eq. 20"""
     corners = mesh.faces[faces]
     return (np.einsum("nc,ncd->nd", bary, mesh.vertices[corners]),
             np.einsum("nc,ncd->nd", bary, mesh.vertex_normals[corners]))
 
 
 def from_normal_volume(mesh: Mesh, faces: np.ndarray, bary: np.ndarray, heights: np.ndarray) -> np.ndarray:
-    """The points (n, 3) at heights (n,), metres, above places of a control mesh. [Statues] Eq. 19"""
+    """Compute the points (n, 3) at heights (n,), metres, above places of a control mesh. [Statues] Eq. 19"""
     p, n = interpolate(mesh, faces, bary)
     return p + heights[:, None] * n
 
 
 def to_normal_volume(mesh: Mesh, points: np.ndarray, reach: float) -> NormalCoordinates:
-    """Every point's (n, 3) triangle, place and least height, at most `reach` up or down. [Statues] Eq. 19, 20"""
+    """Find each point's (n, 3) triangle, place and smallest height, at most `reach` up or down. [Statues] Eq. 19, 20"""
     count = len(points)
     face, bary, height = np.full(count, -1), np.zeros((count, 3)), np.full(count, np.nan)
     which, triangle = _near(mesh, points, reach)
@@ -57,15 +57,18 @@ def to_normal_volume(mesh: Mesh, points: np.ndarray, reach: float) -> NormalCoor
     solutions = np.bincount(who, minlength=count) - np.bincount(who[order][1:][again], minlength=count)
     order = np.argsort(np.abs(d), kind="stable")
     _, first = np.unique(who[order], return_index=True)
-    best = order[first]                                                 # of several the least height
+    best = order[first]                                                 # among several the smallest height
     face[who[best]], bary[who[best]], height[who[best]] = of[best], b[best], d[best]
     return NormalCoordinates(face, bary, height, solutions)
 
 
 def solve_triangles(mesh: Mesh, faces: np.ndarray, points: np.ndarray, reach: float
                     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Heights at which points (n, 3) lie in given triangles (n,), displaced; only where these are not inverted.
-    Which pair each solution is of (k,), its height (k,) in metres, its bary (k, 3).
+    """Solve for heights at which points (n, 3) lie in displaced triangles (n,) that are not inverted.
+
+    Returns the pair of each solution (k,), its height (k,), metres, and its barycentric coordinates (k, 3).
+
+    [Statues] Eq. 19
     """
     def det(a: np.ndarray, b: np.ndarray, c: np.ndarray) -> np.ndarray:
         return np.einsum("nd,nd->n", a, np.cross(b, c))
@@ -87,9 +90,9 @@ def solve_triangles(mesh: Mesh, faces: np.ndarray, points: np.ndarray, reach: fl
 
 
 def _roots(c: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Real roots in [-1, 1] of cubics (k, 4), whose leading coefficient may vanish, and of which cubic each is.
+    """Find the real roots in [-1, 1] of cubics (k, 4), whose leading coefficient may vanish; also the cubic of each.
 
-    Between its turning points a cubic has one root or none, which is found by halving.
+    Between its turning points a cubic has one root or none, which is found by bisection.
     """
     a, b, k = 3 * c[:, 3], c[:, 2], c[:, 1]                  # its derivative is a x² + 2 b x + k
     q = -(b + np.copysign(np.sqrt(np.maximum(b * b - a * k, 0)), b))
@@ -111,7 +114,7 @@ def _value(c: np.ndarray, x: np.ndarray) -> np.ndarray:
 
 
 def _near(mesh: Mesh, points: np.ndarray, reach: float) -> tuple[np.ndarray, np.ndarray]:
-    """Pairs (points, triangles): all where a point may lie in a triangle's volume, and some more.
+    """Find pairs (points, triangles) where a point may lie in a triangle's volume, and some more.
 
     The volume lies in the convex hull of the corners displaced up and down, so in its box and the ball around it.
     """
@@ -140,9 +143,9 @@ class Crossings:
 
 
 def outer_layers(found: Crossings) -> Crossings:
-    """The crossings that meet the scan from outside, sheets of overlapping views as one at their mean height.
+    """Select crossings that meet the scan from outside; overlapping views count once, at their mean height.
 
-    Two layers of a fold have one between them that is met from inside; two views of one surface have not.
+    Two layers of a fold have a crossing from inside between them; two views of one surface have not.
     """
     outside = found.cosines > 0
     layer = np.cumsum(~outside)[outside]
@@ -158,9 +161,9 @@ def outer_layers(found: Crossings) -> Crossings:
 
 
 def find_crossings(scan: Mesh, rays: Rays, points: np.ndarray, normals: np.ndarray, reach: float) -> Crossings:
-    """Every crossing of normals (n, 3), of any length, at points (n, 3) with a scan, at most `reach` metres away.
+    """Find all crossings of normals (n, 3), of any length, at points (n, 3) with a scan, at most `reach` metres away.
 
-    Embree tells which triangle is met, in single precision; where, the triangle's plane says in double.
+    Embree finds the triangles in single precision; their planes give the heights in double precision.
     """
     length = np.maximum(np.linalg.norm(normals, axis=1), 1e-12)
     along = normals / length[:, None]
@@ -193,9 +196,9 @@ def find_crossings(scan: Mesh, rays: Rays, points: np.ndarray, normals: np.ndarr
 
 
 def limits(control: Mesh, points: np.ndarray, normals: np.ndarray, reach: float) -> tuple[np.ndarray, np.ndarray]:
-    """Least and greatest distance (n,) along normals before which no other body part is met, metres.
+    """Compute the least and greatest distance (n,) along normals, metres, before another body part is met.
 
-    Heights go three quarters of the way to the other side of a limb, or across a gap; 3 mm are never another body part.
+    That is three quarters of the way to the other side of a limb, or across a gap, and at least 3 mm.
     """
     along = normals / np.maximum(np.linalg.norm(normals, axis=1), 1e-12)[:, None]
     rays, most, ends = Rays(control), reach / 0.75, []
@@ -206,7 +209,7 @@ def limits(control: Mesh, points: np.ndarray, normals: np.ndarray, reach: float)
 
 
 def not_inverted(control: Mesh, faces: np.ndarray, bary: np.ndarray, heights: np.ndarray) -> np.ndarray:
-    """(n,) bool: up to these heights the displaced triangles are nowhere inverted.
+    """Find where displaced triangles are nowhere inverted up to these heights, (n,) bool.
 
     The area of the displaced triangle, as seen along the normal, is a quadratic in the height, and 1 at height 0.
     """

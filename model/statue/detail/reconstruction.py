@@ -46,10 +46,11 @@ class Reconstruction:
         self._sum = sparse.gatherer(number[self._a], len(self._carriers))
 
     def __call__(self, control_vertices: np.ndarray) -> np.ndarray:
-        """(n, 3) metres, the detailed surface on control vertices (N, 3)."""
+        """Compute the detailed surface (n, 3), metres, on control vertices (N, 3)."""
         moved = self.control.mesh.with_vertices(control_vertices)
         v, n = moved.vertices, moved.vertex_normals
         out = self._spread @ np.concatenate([v, n])
+        # vector displacements rotate with the edges around their control vertices
         if len(self._rotated):
             S = sparse.sum_groups(self._sum, (v[self._a] - v[self._b])[:, :, None] * self._edges[:, None])
             S = S + n[self._carriers][:, :, None] * self._normals[:, None]
@@ -58,19 +59,19 @@ class Reconstruction:
         return out
 
     def mesh(self, control_vertices: np.ndarray | None = None) -> Mesh:
-        """The detailed surface, where the scan stood if no vertices are given."""
+        """Build the mesh of the detailed surface; by default where the scan stood."""
         return Mesh(self(self.control.mesh.vertices if control_vertices is None else control_vertices), self.faces)
 
 
 def coverage_at(control: ControlModel, map: DisplacementMap, faces: np.ndarray, bary: np.ndarray) -> np.ndarray:
-    """(n,) what the map says at places on triangles: MEASURED, FOLDED or HOLE; at a rim what the pixel beside says."""
+    """Look up the coverage (n,) at places on triangles: MEASURED, FOLDED or HOLE; at a rim that of the pixel beside."""
     inwards = 0.9 * bary + 0.1 / 3                              # a pixel at a seam may lie outside the chart
     found = map.coverage[pixels_at(map, chart_places(control.chart, faces, inwards))]
     return np.where(found == OUTSIDE, MEASURED, found)
 
 
 def displace_surface(control: ControlModel, map: DisplacementMap) -> Displaced:
-    """Where the detailed surface is above any places of the control mesh, for `subdivide_adaptive`."""
+    """Make the function of the detailed surface above any places of the control mesh, for `subdivide_adaptive`."""
     def displaced(faces: np.ndarray, bary: np.ndarray) -> np.ndarray:
         p, n = interpolate(control.mesh, faces, bary)
         heights, rest = _parts(control, map, faces, bary)
@@ -80,20 +81,20 @@ def displace_surface(control: ControlModel, map: DisplacementMap) -> Displaced:
 
 def _parts(control: ControlModel, map: DisplacementMap, faces: np.ndarray, bary: np.ndarray
            ) -> tuple[np.ndarray, np.ndarray]:
-    """Heights (n,) along the interpolated normal and, where there are vectors, what is off it (n, 3)."""
+    """Split the map into heights (n,) along the interpolated normal and, with vectors, the rest (n, 3)."""
     uv = chart_places(control.chart, faces, bary)
     heights = bilinear(map.heights, uv)
     rest = np.zeros((len(uv), 3)) if map.vectors is None else bilinear(map.vectors, uv)
-    some = np.flatnonzero(rest.any(axis=1))
-    _, n = interpolate(control.mesh, faces[some], bary[some])
-    along = np.einsum("nd,nd->n", rest[some], n) / np.maximum(np.einsum("nd,nd->n", n, n), 1e-12)
-    heights[some] += along
-    rest[some] -= along[:, None] * n
+    chosen = np.flatnonzero(rest.any(axis=1))
+    _, n = interpolate(control.mesh, faces[chosen], bary[chosen])
+    along = np.einsum("nd,nd->n", rest[chosen], n) / np.maximum(np.einsum("nd,nd->n", n, n), 1e-12)
+    heights[chosen] += along
+    rest[chosen] -= along[:, None] * n
     return heights, rest
 
 
 def pixels_at(map: DisplacementMap, uv: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Rows and columns (n,) of the pixels at places (n, 2)."""
+    """Find rows and columns (n,) of the pixels at texture coordinates (n, 2)."""
     height, width = map.coverage.shape
     return (np.clip(((1 - uv[:, 1]) * height).astype(int), 0, height - 1),
             np.clip((uv[:, 0] * width).astype(int), 0, width - 1))
@@ -111,7 +112,7 @@ class Level:
 
 
 def measure_levels(statue: Statue, scan: Mesh, count: int = 4) -> tuple[list[Level], Subdivision]:
-    """The reconstruction at every level with its distance to the scan, and the finest subdivision.
+    """Reconstruct at every level and measure the distance to the scan; also return the finest subdivision.
 
     [Statues] Eq. 22, 23
     """
@@ -123,7 +124,7 @@ def measure_levels(statue: Statue, scan: Mesh, count: int = 4) -> tuple[list[Lev
 
 
 def adaptive_level(statue: Statue, scan: Mesh, tolerance: float = 0.0005, level: int = 4) -> Level:
-    """The reconstruction on triangles that are small only where the displacement asks for it by a tolerance, metres."""
+    """Reconstruct on triangles that are small only where the displaced surface needs it, by a tolerance in metres."""
     control = statue.control
     fine = subdivide_adaptive(control.mesh, control.chart, displace_surface(control, statue.map), tolerance, level)
     return _level(f"adaptive, {1000 * tolerance:g} mm", statue, fine, scan)
@@ -145,14 +146,16 @@ class SurfaceError:
 
     @staticmethod
     def of(distances: np.ndarray) -> SurfaceError:
-        """That of distances (n,), NaN where there are none."""
+        """Summarise distances (n,); NaN where there are none."""
         if not len(distances):
             return SurfaceError(np.nan, np.nan)
         return SurfaceError(float(distances.mean()), float(np.sqrt(np.mean(distances**2))))
 
 
 def reconstruction_error(reconstructed: Mesh, scan: Mesh, count: int = 200_000) -> SurfaceError:
-    """Distance from a reconstructed surface to the scan, one way, at so many places spread evenly. [Statues] Eq. 22, 23
+    """Measure the distance from a reconstructed surface to the scan, one way, at `count` even points.
+
+    [Statues] Eq. 22, 23
     """
     points = reconstructed.sample(count, np.random.default_rng(14))[0]
     return SurfaceError.of(Surface(scan).closest(points).distances)
@@ -160,7 +163,7 @@ def reconstruction_error(reconstructed: Mesh, scan: Mesh, count: int = 200_000) 
 
 def remaining_error(control: ControlModel, map: DisplacementMap, scan: Mesh, count: int = 20_000,
                     reach: float = 0.03) -> SurfaceError:
-    """Distance of places on the scan to what the map makes of them, where it is one-to-one: e of the paper's tables.
+    """Measure the distance of scan points to their reconstruction where the map is one-to-one: e in the paper's tables.
 
     NaN where no place of the scan is mapped one-to-one.
     """
@@ -175,8 +178,10 @@ def remaining_error(control: ControlModel, map: DisplacementMap, scan: Mesh, cou
 
 def find_inverted(control: ControlModel, vertices: np.ndarray, subdivision: Subdivision, detailed: np.ndarray
                   ) -> np.ndarray:
-    """Fine triangles, ascending, with vertices `detailed` (n, 3), whose normal opposes the interpolated one of the
-    control surface below, with vertices (N, 3): a steep flank is not inverted where the control mesh has an edge.
+    """Find inverted fine triangles, with vertices `detailed` (n, 3): their normal opposes the control surface's.
+
+    The control surface has vertices (N, 3), and its normal is interpolated. So a steep flank at an edge of the control
+    mesh does not count as inverted.
     """
     _, n = interpolate(control.mesh.with_vertices(vertices), subdivision.parent, subdivision.bary)
     below = n[subdivision.faces].sum(axis=1)
@@ -184,9 +189,9 @@ def find_inverted(control: ControlModel, vertices: np.ndarray, subdivision: Subd
 
 
 def in_folds(control: ControlModel, map: DisplacementMap, subdivision: Subdivision) -> np.ndarray:
-    """(f,) bool: fine triangles with a corner or their middle on, or beside, a pixel in a fold or hole.
+    """Find fine triangles with a corner or centre on, or beside, a pixel in a fold or hole: (f,) bool.
 
-    With vectors also where these take part, some way around folds.
+    With vectors, also where these are not zero around folds.
     """
     from scipy.ndimage import maximum_filter
 

@@ -99,7 +99,9 @@ def fit_surface(rest: Mesh, start: np.ndarray, scan: Mesh, config: SurfaceFitCon
     start : (N, 3) float, metres
         Its vertices near the scan.
     scan : Mesh
-        May have holes.
+        The scan, which may have holes.
+    config : SurfaceFitConfig, optional
+        Settings.
     progress : callable, optional
         Called as progress(done, total).
     hidden : (N,) bool, optional

@@ -1,4 +1,4 @@
-"""Markers clicked on a scan of the person who wears them: the completed body tells where they sit on the model."""
+"""Markers clicked on a scan of the person who wears them: the completed body gives their layout on the model."""
 from __future__ import annotations
 
 from collections.abc import Mapping
@@ -18,12 +18,12 @@ LAYOUT = "layout.json"
 
 
 def extra_markers(places: Mapping[str, np.ndarray], marks: Mapping[str, int]) -> dict[str, np.ndarray]:
-    """Of all that was clicked on a scan what is no landmark of the model."""
+    """Return the clicked points that are not landmarks of the model."""
     return {name: place for name, place in places.items() if name not in marks}
 
 
-def write_worn(folder: Path, done: Completion, places: Mapping[str, np.ndarray]) -> list[Metric]:
-    """Write the layout of markers at places (3,) of the scan; how many there are and how far from the completed body.
+def write_clicked_markers(folder: Path, done: Completion, places: Mapping[str, np.ndarray]) -> list[Metric]:
+    """Write the layout of markers at places (3,) of the scan; return their number and distance from the body.
 
     [SCAPE] §8
     """
@@ -38,12 +38,12 @@ def write_worn(folder: Path, done: Completion, places: Mapping[str, np.ndarray])
 
 
 def is_recording(path: Path) -> bool:
-    """Whether a file is one of measured markers."""
+    """Tell whether a file is a recording of markers."""
     return path.suffix.lower() in READERS
 
 
-def labels_of(given: str | Path) -> tuple[str, ...]:
-    """The labels of a recording, or of a marker set that comes along; none of anything else."""
-    if isinstance(given, Path):
-        return read_markers(given, usual_rate=USUAL_RATE).labels if is_recording(given) else ()
-    return set_labels(given) if given in layout_names() else ()
+def labels_of(source: str | Path) -> tuple[str, ...]:
+    """Return the labels of a recording or of a built-in marker set; none for anything else."""
+    if isinstance(source, Path):
+        return read_markers(source, usual_rate=USUAL_RATE).labels if is_recording(source) else ()
+    return set_labels(source) if source in layout_names() else ()

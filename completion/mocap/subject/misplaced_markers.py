@@ -1,7 +1,7 @@
-"""Markers that are not worn where the layout has them: sought over the whole body, pairs of exchanged names first.
+"""Misplaced markers: those not where the layout has them are searched on the whole body, exchanged names first.
 
-A marker that keeps its place on the skin, but another one than the layout's, is an outlier in every frame. The body is
-fitted to the others; where it then has the marker, in frames that differ most, is where the marker is worn.
+A misplaced marker is an outlier in every frame, but keeps its place on the skin. So the body is fitted to the other
+markers, in frames that differ most. The point of the skin nearest to the marker in all frames is its place.
 """
 from __future__ import annotations
 
@@ -26,24 +26,24 @@ from .frame_starts import mean_person, stand_off, start_frames
 from .latent_fit import distance_reach
 from .person import PersonConfig, PersonFit, common_markers, find_person, judge_moves
 
-FAR = 0.06                           # metres, RMS over frames, from its usual place: worn elsewhere
+FAR = 0.06                           # metres, RMS over frames, from its usual place beyond which it is misplaced
 
 
 @dataclass(frozen=True, eq=False)
 class MovedMarker:
-    """A marker that is worn elsewhere.
+    """A misplaced marker, and the place where it was found.
 
     Attributes
     ----------
     label : str
     corners : (3,) int
-        The vertices of the triangle on which it was found.
+        Vertices of the triangle on which it was found.
     weights : (3,) float
-        Of the corners.
+        Barycentric weights of the corners.
     distance : float, metres
         From the skin.
     before, after : float, metres
-        RMS distance over the frames from where the layout has it, and from where it was found.
+        RMS distance over the frames from the layout's place, and from the place that was found.
     """
 
     label: str
@@ -55,21 +55,22 @@ class MovedMarker:
 
 
 @dataclass(frozen=True, eq=False)
-class Worn:
-    """How the markers are worn, as far as the layout is wrong about it.
+class MisplacedMarkers:
+    """Differences between a layout and the markers of a recording.
 
     Attributes
     ----------
     moved : tuple of MovedMarker
+        Markers with another place on the skin.
     exchanged : pairs of labels
-        Markers that bear each other's name throughout.
+        Markers with each other's name throughout.
     unplaced : labels
-        Markers that are far from where the layout has them and that no place on the skin explains; they are left out.
+        Markers that are far from the layout's place and that no place on the skin explains; they are left out.
     too_many : labels
-        Markers that are far from where the layout has them, and so many that the body is at fault: nothing is changed.
-    lost : (part, labels, whole) of parts
-        Parts of the body of which most markers, or all (`whole`), are not where the layout has them: the part is at
-        fault, not its markers. They are kept, and weighed.
+        Markers that are far from the layout's place, so many that the body is at fault: nothing is changed.
+    lost : tuple of (part, labels, whole)
+        Parts of the body of which most markers, or all (`whole`), are misplaced. Then the pose of the part is at fault:
+        its markers are kept, and weighted as usual.
     """
 
     moved: tuple[MovedMarker, ...] = ()
@@ -80,11 +81,11 @@ class Worn:
 
     @property
     def changes(self) -> bool:
-        """Whether anything is to be done otherwise than the layout says."""
+        """Whether the layout or the names have to be changed."""
         return bool(self.moved or self.exchanged or self.unplaced)
 
     def metrics(self) -> list[Metric]:
-        """A row for each thing that is otherwise than the layout says."""
+        """Return a row for each difference from the layout."""
         return [*(Metric("names exchanged throughout, put back", " and ".join(pair)) for pair in self.exchanged),
                 *(Metric(f"worn elsewhere, moved there ({m.label})", 1000 * m.before, "mm") for m in self.moved),
                 *(Metric("far from the layout's place, and found nowhere: left out", label) for label in self.unplaced),
@@ -93,12 +94,14 @@ class Worn:
                          ", ".join(labels)) for part, labels, whole in self.lost)]
 
     def judgement(self, labels: Sequence[str]) -> Judgement:
-        """Whether a person found with these markers can be used; `labels` are all those of the recording."""
+        """Judge a person found with these markers; `labels` are all those of the recording."""
         sides, check = sum(i < j for i, j in enumerate(label_pairs(labels))), list[str]()
+        # more than half of the pairs exchanged: another convention, or a mirrored recording
         if 2 * len(self.exchanged) > sides:
             check.append(f"left and right of {len(self.exchanged)} of {number_of(sides, 'pair')} of markers were "
                          "exchanged and put back: labels of the other side, or a mirrored recording, which is to be "
                          "mirrored first?")
+        # parts whose markers are all misplaced fail, those with most of them are a doubt
         parts, some = ([f"{share} markers of the {part} ({', '.join(names)}) are far from where the layout says: wrong "
                         "labels there, another layout, or a model that knows no such body?"
                         for part, names, whole in self.lost if whole == wanted]
@@ -112,11 +115,11 @@ class Worn:
         return judge_moves({m.label: m.before for m in self.moved}, len(labels)).merge(Judgement.of(parts, check))
 
     def restore_names(self, sequence: MarkerSequence, layout: MarkerLayout) -> MarkerSequence:
-        """A sequence with exchanged names put back."""
+        """Return a sequence with exchanged names corrected."""
         return MarkerSequence(sequence.positions[:, self.order(sequence, layout)], sequence.labels, sequence.rate)
 
     def order(self, sequence: MarkerSequence, layout: MarkerLayout) -> np.ndarray:
-        """From which column (L,) of a sequence each of its labels is to be taken."""
+        """Return the column (L,) of a sequence from which each of its labels is taken."""
         rows = {layout.aliases.get(label, label): sequence.labels.index(label)
                 for label in layout.match_labels(sequence.labels, 0)}
         order = np.arange(len(sequence.labels))
@@ -127,20 +130,21 @@ class Worn:
         return order
 
     def update_layout(self, layout: MarkerLayout) -> MarkerLayout:
-        """A layout with the moved markers where they are worn, at its end, and without those found nowhere."""
+        """Return a layout with the moved markers at their new places, at its end, and without the unplaced ones."""
         layout = layout.without(self.unplaced) if self.unplaced else layout
         if not self.moved:
             return layout
-        found = MarkerLayout(tuple(m.label for m in self.moved), np.array([m.corners for m in self.moved]),
+        new_places = MarkerLayout(tuple(m.label for m in self.moved), np.array([m.corners for m in self.moved]),
                              np.array([m.distance for m in self.moved]), np.array([m.weights for m in self.moved]))
-        return replace(layout.without(found.labels).merge(found), aliases=layout.aliases)
+        return replace(layout.without(new_places.labels).merge(new_places), aliases=layout.aliases)
 
 
 class _Frames:
-    """The bodies of a person in their frames, and the markers there."""
+    """The fitted bodies of a person in their frames, and the measured markers there."""
 
     def __init__(self, model: BodyModel, person: PersonFit, sequences: Sequence[MarkerSequence], layout: MarkerLayout,
                  wand: float) -> None:
+        # measured markers, bodies with their normals, and the layout's places on the bodies, for every frame of the fit
         self.layout, positions = common_markers(sequences, layout)
         self.targets = np.stack([positions[which][t] for which, t in person.frames])                  # (B, L, 3)
         self.vertices = model.subject(person.betas).vertices(person.poses, person.trans).astype(float)     # (B, N, 3)
@@ -152,20 +156,20 @@ class _Frames:
         self.places = np.stack([self.layout.place(body) for body in bodies])                          # (B, L, 3)
 
     def off_skin(self, row: int, least: float, greatest: float) -> tuple[np.ndarray, np.ndarray]:
-        """(N,) RMS distance of a marker from every vertex, lifted off the skin within limits, and how far; metres."""
+        """Compute the RMS distance (N,) of a marker from every vertex, lifted off the skin, and the lift (N,)."""
         seen = np.isfinite(self.targets[:, row, 0])
         apart, lift = stand_off(self.targets[seen, row], self.vertices[seen], self.normals[seen], least, greatest)
         return _rms(apart), lift
 
     def off_place(self, row: int, of: int) -> float:
-        """RMS distance of a marker from the usual place of one, that of a loose one anywhere along its part, metres.
+        """Compute the RMS distance, metres, of a marker `row` from the usual place of a marker `of`.
 
-        Where the distance from the skin is unknown, what a marker stands off the skin is not counted.
+        A loose marker may be anywhere along its part. Where the distance from the skin is unknown, it is not counted.
         """
         loose, least, greatest = self.layout.labels[of] in self.layout.loose, self.reach[0][of], self.reach[1][of]
         if not (loose or least < greatest) or not np.isfinite(self.targets[:, row, 0]).any():
             return float(_rms(np.linalg.norm(self.targets[:, row] - self.places[:, of], axis=1)))
-        # a loose marker may be 20 cm along its part from its usual place
+        # a loose marker may be 20 cm along its part from its usual place, about half a thigh
         centre = self.layout.nearest[of]
         near = (np.linalg.norm(self.template.vertices - self.template.vertices[centre], axis=1) < 0.2) \
             & (self.part == self.part[centre]) if loose else [centre]
@@ -173,32 +177,32 @@ class _Frames:
 
     @cached_property
     def off(self) -> np.ndarray:
-        """(L,) RMS distance of every marker from its own usual place, NaN for one seen in fewer than 4 frames."""
+        """RMS distance (L,), metres, of every marker from its usual place; NaN for one seen in fewer than 4 frames."""
         often = np.isfinite(self.targets[..., 0]).sum(axis=0) >= 4
         return np.array([self.off_place(row, row) if seen else np.nan for row, seen in enumerate(often)])
 
     def far(self, least: float) -> float:
-        """From how far off its usual place on a marker is suspected, at least so far, metres.
+        """Compute the distance from its usual place, metres, beyond which a marker is suspected; at least `least`.
 
-        It is farther, four times the median marker's distance, on a body that the model hardly knows, but where labels
-        are mixed up no farther than twice `FAR`.
+        It grows to four times the median distance on a body that the model hardly knows. It stays below twice `FAR`,
+        since mixed-up labels also raise the median.
         """
         return float(np.clip(4.0 * np.nanmedian(self.off), least, 2 * FAR)) if np.isfinite(self.off).any() else least
 
 
 def _rms(apart: np.ndarray) -> np.ndarray:
-    """The root of the mean square over the first axis, of what is not NaN."""
+    """Compute the root mean square over the first axis, without NaN."""
     seen = np.isfinite(apart)
     total, count = np.where(seen, apart, 0.0)**2, seen.sum(axis=0)
     return np.where(count > 0, np.sqrt(total.sum(axis=0) / np.maximum(count, 1)), np.nan)
 
 
-def find_worn(model: BodyModel, sequences: Sequence[MarkerSequence], layout: MarkerLayout, person: PersonFit,
-              config: PersonConfig) -> Worn:
-    """Which markers are worn elsewhere than in a layout, and where; which pairs bear each other's name.
+def find_misplaced_markers(model: BodyModel, sequences: Sequence[MarkerSequence], layout: MarkerLayout,
+                           person: PersonFit, config: PersonConfig) -> MisplacedMarkers:
+    """Find markers that are not where a layout has them, their places, and pairs with exchanged names.
 
-    The body is fitted without the markers that are suspected until they are the same as before. One that it puts back
-    near its usual place, though it was left out, is where it should be and not suspected again.
+    The body is fitted without the suspected markers until the suspects do not change. A suspect that ends near its
+    usual place, though it was left out, is cleared and not suspected again.
 
     Parameters
     ----------
@@ -209,52 +213,59 @@ def find_worn(model: BodyModel, sequences: Sequence[MarkerSequence], layout: Mar
     person : PersonFit
         Fitted to all of them.
     config : PersonConfig
+        Settings of that fit.
+
+    Returns
+    -------
+    MisplacedMarkers
+        Distances in metres.
 
     [MoSh]
     """
-    # few betas do not follow a wrong marker
+    # with 20 betas the shape cannot follow a wrong marker
     rough = replace(config, n_betas=20, annealing=(40.0, 10.0, 2.0, 1.0))
     sides, sequences, at = _find_exchanged_sides(model, sequences, layout,
                                                  _Frames(model, person, sequences, layout, config.wand), rough)
-    # who is far off on the body of the others; at first, on one that all have drawn, 4 cm are enough
+    # suspects: markers far off on the body of the others; at first, on a body that all have attracted, 4 cm are enough
     suspects, cleared, far = frozenset[str](), frozenset[str](), FAR if sides else 0.04
     for _ in range(4):
         off, limit = dict(zip(at.layout.labels, np.nan_to_num(at.off).tolist(), strict=True)), at.far(far)
         cleared |= {label for label in suspects if off[label] <= max(limit, FAR)}
         before, suspects = suspects, frozenset(label for label in off if label not in cleared and off[label] > limit)
-        if len(suspects) > 0.25 * len(off):                             # not they are at fault, but the body
-            return Worn(too_many=tuple(label for label in at.layout.labels if label in suspects))
+        if len(suspects) > 0.25 * len(off):                             # so many: the body is at fault
+            return MisplacedMarkers(too_many=tuple(label for label in at.layout.labels if label in suspects))
         if suspects == before:
             break
         at, far = _without(model, sequences, layout, suspects, rough), FAR
+    # the final fit without the suspects explains each by an exchange or by another place
     if suspects:
         at = _without(model, sequences, layout, suspects, config)
-    found = _explain(at, suspects)
+    explained = _explain(at, suspects)
 
-    # two exchanged names on a leg can draw all its markers away: what was found nowhere is sought on the body without
-    if found.unplaced and (found.moved or found.exchanged):
-        renamed = [found.restore_names(each, layout) for each in sequences]
-        placed = replace(found, unplaced=()).update_layout(layout)
+    # two exchanged names on a leg can pull all its markers away: unplaced markers are searched again on the new body
+    if explained.unplaced and (explained.moved or explained.exchanged):
+        renamed = [explained.restore_names(each, layout) for each in sequences]
+        placed = replace(explained, unplaced=()).update_layout(layout)
         again = _without(model, renamed, placed, (), config)
         off, limit = dict(zip(again.layout.labels, again.off, strict=True)), again.far(FAR)
-        gone = [label for label in found.unplaced if off[label] > limit]
-        rest = _explain(_without(model, renamed, placed, gone, config), gone) if gone else Worn()
-        found = Worn(found.moved + rest.moved, found.exchanged + rest.exchanged, rest.unplaced)
-    found = _with_whole_parts(at, found, model.skeleton.names)
-    back = set(sides) & set(found.exchanged)                            # exchanged, and put back
-    return replace(found, exchanged=tuple(pair for pair in (*sides, *found.exchanged) if pair not in back))
+        gone = [label for label in explained.unplaced if off[label] > limit]
+        rest = _explain(_without(model, renamed, placed, gone, config), gone) if gone else MisplacedMarkers()
+        explained = MisplacedMarkers(explained.moved + rest.moved, explained.exchanged + rest.exchanged, rest.unplaced)
+    explained = _with_whole_parts(at, explained, model.skeleton.names)
+    back = set(sides) & set(explained.exchanged)                            # exchanged twice: not at all
+    return replace(explained, exchanged=tuple(pair for pair in (*sides, *explained.exchanged) if pair not in back))
 
 
-def _with_whole_parts(at: _Frames, found: Worn, names: Sequence[str]) -> Worn:
-    """What was found, but for parts of the body that would lose most of their markers: those keep them all."""
+def _with_whole_parts(at: _Frames, found: MisplacedMarkers, names: Sequence[str]) -> MisplacedMarkers:
+    """Keep all markers of parts that would lose most of them, and list these parts in `lost`."""
     part_of_marker = at.part[at.layout.nearest]
     ends = {m.label: at.part[m.corners[m.weights.argmax()]] for m in found.moved}
     kept, lost = set[str](), []
     for part in np.unique(part_of_marker).tolist():
-        mine = [label for label, of in zip(at.layout.labels, part_of_marker, strict=True) if of == part]
-        gone = [label for label in mine if label in found.unplaced or ends.get(label, part) != part]
-        if len(gone) > max(1, len(mine) / 2):
-            lost.append((names[part], tuple(gone), len(gone) == len(mine)))
+        of_part = [label for label, of in zip(at.layout.labels, part_of_marker, strict=True) if of == part]
+        gone = [label for label in of_part if label in found.unplaced or ends.get(label, part) != part]
+        if len(gone) > max(1, len(of_part) / 2):
+            lost.append((names[part], tuple(gone), len(gone) == len(of_part)))
             kept.update(gone)
     return replace(found, moved=tuple(m for m in found.moved if m.label not in kept),
                    unplaced=tuple(label for label in found.unplaced if label not in kept), lost=tuple(lost))
@@ -262,28 +273,29 @@ def _with_whole_parts(at: _Frames, found: Worn, names: Sequence[str]) -> Worn:
 
 def _without(model: BodyModel, sequences: Sequence[MarkerSequence], layout: MarkerLayout, suspects: Collection[str],
              config: PersonConfig) -> _Frames:
-    """The body that is fitted without some markers, and all markers on it."""
+    """Fit a person without some markers, and return its bodies with all markers."""
     others = layout.without([label for label in layout.labels if label in suspects])
     return _Frames(model, find_person(model, sequences, others, config), sequences, layout, config.wand)
 
 
 def _find_exchanged_sides(model: BodyModel, sequences: Sequence[MarkerSequence], layout: MarkerLayout, at: _Frames,
                           rough: PersonConfig) -> tuple[tuple[tuple[str, str], ...], Sequence[MarkerSequence], _Frames]:
-    """Left and right exchanged on a limb or the whole body, where many markers are far off: others do not tell then.
+    """Test whether left and right are exchanged on a limb or on the whole body, where many markers are far off.
 
-    Returned are the pairs, the sequences under their right names, and the body on them.
+    The other markers cannot tell it then. Returned are the pairs, the sequences with corrected names, and the body.
     """
     def burden(off: np.ndarray) -> float:
-        """The sum of distances (L,), NaN for none; beyond some distance it does not matter how far a marker is."""
+        """Sum distances (L,), each limited to twice FAR: beyond, it does not matter how far off a marker is."""
         return float(np.minimum(np.nan_to_num(off), 2 * FAR).sum())
 
     best: tuple[tuple[tuple[str, str], ...], Sequence[MarkerSequence], _Frames] = (), sequences, at
     if (np.nan_to_num(at.off) > FAR).sum() < 5:
         return best
+    # a quick test with the mean person, then a full fit for limbs that pass it
     labels, mean = at.layout.labels, mean_person(model.subject(np.zeros(model.n_betas)), at.layout)
 
     def by_mean(targets: np.ndarray) -> float:
-        """How badly the mean person explains markers (B, L, 3): a fit of poses tells soon."""
+        """Compute how badly the mean person explains markers (B, L, 3), from poses alone."""
         x = start_frames(mean, targets, lambda done: None)
         return burden(_rms(np.linalg.norm(mean.positions(x) - targets, axis=2)))
 
@@ -293,7 +305,7 @@ def _find_exchanged_sides(model: BodyModel, sequences: Sequence[MarkerSequence],
         for i, j in pairs:
             order[[i, j]] = j, i
         if by_mean(at.targets[:, order]) < as_they_came:
-            names = Worn(exchanged=tuple((labels[i], labels[j]) for i, j in pairs))
+            names = MisplacedMarkers(exchanged=tuple((labels[i], labels[j]) for i, j in pairs))
             renamed = [names.restore_names(each, layout) for each in sequences]
             other = _Frames(model, find_person(model, renamed, layout, rough), renamed, layout, rough.wand)
             if burden(other.off) < min(0.5 * burden(at.off), burden(best[2].off)):
@@ -302,7 +314,7 @@ def _find_exchanged_sides(model: BodyModel, sequences: Sequence[MarkerSequence],
 
 
 def _limbs(parents: np.ndarray, at: _Frames) -> list[list[tuple[int, int]]]:
-    """The pairs of left and right: all, and those of each pair of limbs, which part where their bones do."""
+    """Return pairs of left and right markers: all of them, and those of each pair of limbs below a fork of bones."""
     pairs = [(i, int(j)) for i, j in enumerate(label_pairs(at.layout.labels)) if i < j]
     limbs: dict[tuple[int, int], list[tuple[int, int]]] = {}
     for i, j in pairs:
@@ -313,33 +325,36 @@ def _limbs(parents: np.ndarray, at: _Frames) -> list[list[tuple[int, int]]]:
     return [pairs, *limbs.values()] if pairs else []
 
 
-def _explain(at: _Frames, suspects: Collection[str]) -> Worn:
-    """What explains the suspects: a pair of exchanged names, or another place on the skin."""
+def _explain(at: _Frames, suspects: Collection[str]) -> MisplacedMarkers:
+    """Explain suspects by pairs of exchanged names or by another place on the skin."""
     if not suspects:
-        return Worn()
+        return MisplacedMarkers()
     labels, far, exchanged = at.layout.labels, at.far(FAR), []
     rows = {i for i, label in enumerate(labels) if label in suspects and at.off[i] > far}
+    # distance of each suspect from the usual place of each other one, the best pair first
     crossed = [(at.off_place(i, j), at.off_place(j, i), i, j) for i, j in combinations(sorted(rows), 2)]
-    gain = 0.4  # share of the distance from the usual place that another place leaves at most
+    gain = 0.4  # another explanation has to leave less than that share of the distance
     for one, other, i, j in sorted(crossed, key=lambda both: max(both[:2])):
         if {i, j} <= rows and max(one, other) < FAR and one + other < gain * (at.off[i] + at.off[j]):
             exchanged.append((labels[i], labels[j]))
             rows -= {i, j}
-    # another place explains a marker within 2 cm, or 1.5 times what the others are from their usual places
+    # another place has to lie within 2 cm, or 1.5 times the median distance of the other markers from their places
     limit = max(0.02, 1.5 * float(np.nanmedian(at.off[[i for i, label in enumerate(labels) if label not in suspects]])))
     found = {row: _best_place(at, row) for row in sorted(rows)}
     moved = {row: m for row, m in found.items() if m.after < limit and m.after < gain * m.before}
-    return Worn(tuple(moved.values()), tuple(exchanged), tuple(labels[row] for row in found if row not in moved))
+    return MisplacedMarkers(tuple(moved.values()), tuple(exchanged),
+                            tuple(labels[row] for row in found if row not in moved))
 
 
 def _best_place(at: _Frames, row: int) -> MovedMarker:
-    """Where on the skin a marker is nearest, its distance from it being that of the layout, common or on a wand.
+    """Find the place on the skin nearest to a marker, for the layout's distance from the skin, a common one, or a wand.
 
     [MoSh]
     """
     own, target = float(np.asarray(at.layout.distances)[row]), at.targets[:, row]
     seen, tried = np.isfinite(target[:, 0]), []
     for low, high in {(own, own), (DISTANCE, DISTANCE), (min(own, DISTANCE), max(own, DISTANCE) + at.wand)}:
+        # the nearest vertex, then all triangles around it
         off, lift = at.off_skin(row, low, high)
         vertex = int(off.argmin())
         distance = float(lift[vertex])
