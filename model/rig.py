@@ -52,6 +52,7 @@ class Rig:
 
     def __post_init__(self) -> None:
         N, J = len(self.mesh.vertices), len(self.skeleton.parents)
+        # blend weights that every format can hold; without bone axes those of the world
         if self.weights.shape != (N, J):
             raise ValueError(f"weights: expected shape {(N, J)}, got {self.weights.shape}")
         if not (self.weights >= 0).all() or not np.allclose(self.weights.sum(axis=1), 1, atol=1e-6):

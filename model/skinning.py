@@ -95,6 +95,7 @@ class SkinningModel(BodyModel):
     def __post_init__(self) -> None:
         N, J, K = len(self.template.vertices), len(self.skeleton.parents), len(self.shape_variances)
         C = self.features.count - J
+        # every array has the sizes of the template, the skeleton, the features and the betas
         for name, shape in (("rest", (N, 3)), ("weights", (N, J)), ("correctives", (C, N, 3)),
                             ("shape_mean", (N, 3)), ("shape_components", (K, N, 3))):
             if getattr(self, name).shape != shape:

@@ -23,8 +23,9 @@ from click_app import app, server  # noqa: F401 -- fixtures
 from scanprep.command_line import run
 
 LONGEST = (
-    "readme", "model_learning_resume", "completion_mosh_resume", "scanprep_pipeline_workers", "model_statue_cli",
-    "readme_model", "demo", "model_coregistration_rounds", "model_statue_features", "scanprep_viewer_pick", "judgement",
+    "readme", "readme_scans", "readme_model", "readme_completion", "model_learning_resume",
+    "completion_mosh_resume", "scanprep_pipeline_workers", "model_statue_cli",
+    "demo", "model_coregistration_rounds", "model_statue_features", "scanprep_viewer_pick", "judgement",
     "scanprep_pipeline", "scanprep_registration_start", "model_coregistration", "model_learning_cli",
     "scanprep_skeleton_search", "scanprep_skeleton_find", "scanprep_template", "completion_stream",
     "scanprep_viewer_connection", "completion_viewing_inside", "completion_measuring", "scanprep_registration_nonrigid",

@@ -9,7 +9,7 @@ from completion import MoshConfig, PersonConfig, animate, find_person, mosh
 from completion.mocap.files.markers import MarkerSequence
 from completion.mocap.marker_sets.layout import MarkerLayout
 from completion.mocap.mosh.mosh import PoseConfig
-from completion.mocap.pose.judgement import distrusted_marker_warnings, markers_told
+from completion.mocap.pose.judgement import find_distrusted_markers, markers_told
 from completion.mocap.pose.marked_body import AnimateConfig
 from completion.mocap.subject.attachment import latent_markers
 from completion.mocap.subject.misplaced_markers import (
@@ -313,7 +313,7 @@ def test_a_marker_that_is_never_believed_is_left_out_of_the_mean():
     assert motion.distrusted == ("M03",)
     assert np.nanmean(motion.residuals_of_trusted()) < 5e-3 and np.nanmean(motion.residuals) > 0.01
     assert markers_told([motion]).value == "25 of 26, without M03"
-    assert "M03" in distrusted_marker_warnings([motion])[0]
+    assert "M03" in find_distrusted_markers([motion])[0]
 
 
 def test_left_and_right_exchanged_on_many_markers_are_put_right_together():

@@ -4,6 +4,7 @@ import importlib
 import inspect
 import warnings
 
+import numpy as np
 import pytest
 from numpydoc.docscrape import ClassDoc, FunctionDoc
 
@@ -41,8 +42,9 @@ def test_docstring_says_what_goes_in_and_comes_out(package, name):
 def test_example_runs(package, name, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     found = public(package, name)
-    # of a class all methods too; names are looked up as a user has them: none is imported yet
-    for test in doctest.DocTestFinder(exclude_empty=True, recurse=True).find(found, name, globs={}):
+    # of a class all methods too; an example may use numpy and the public names, all else it imports itself
+    known = {"np": np, **{one: public(where, one) for where, one in NAMES}}
+    for test in doctest.DocTestFinder(exclude_empty=True, recurse=True).find(found, name, globs=known):
         if test.examples:
             result = doctest.DocTestRunner(optionflags=doctest.ELLIPSIS | doctest.NORMALIZE_WHITESPACE).run(test)
             assert not result.failed, test.name

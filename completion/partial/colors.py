@@ -73,19 +73,15 @@ class ColoredView:
         cosine = np.einsum("nd,nd->n", facing, normals)
         # 0.5: normals of scan and body differ by less than 60 degrees
         weight = ((far < config.reach) & (cosine > 0.5)).astype(float)
-        return colors, weight * self._squarely(places, normals) * self._inside(places)
-
-    def _squarely(self, places: np.ndarray, normals: np.ndarray) -> np.ndarray:
-        """Compute weights (n,) by the angle at which the camera looked: cosine squared, at least 0.02 squared."""
-        if self.camera is None:
-            return np.ones(len(places))
-        to = self.camera - places
-        cosine = np.einsum("nd,nd->n", normals, to) / np.linalg.norm(to, axis=1)
-        return np.clip(cosine, 0.02, 1)**2
-
-    def _inside(self, places: np.ndarray) -> np.ndarray:
-        """Compute weights (n,) that fall over the last 15 mm before the border of the view, for smooth seams."""
-        return np.ones(len(places)) if self.rim is None else np.clip(self.rim.query(places)[0] / 0.015, 0.02, 1)
+        # oblique views have less weight: cosine squared, at least 0.02 squared
+        if self.camera is not None:
+            to = self.camera - places
+            cosine = np.einsum("nd,nd->n", normals, to) / np.linalg.norm(to, axis=1)
+            weight = weight * np.clip(cosine, 0.02, 1)**2
+        # so has the last 15 mm before the border of the view, for smooth seams
+        if self.rim is not None:
+            weight = weight * np.clip(self.rim.query(places)[0] / 0.015, 0.02, 1)
+        return colors, weight
 
 
 def carry_colors(body: Mesh, seen: np.ndarray, scan: View | Sequence[View], config: ColorConfig | None = None,
@@ -102,6 +98,7 @@ def carry_colors(body: Mesh, seen: np.ndarray, scan: View | Sequence[View], conf
     scan : Mesh or PointCloud with colours, or a sequence of these
         As given to `complete`; views without colours are left out.
     config : ColorConfig, optional
+        Settings.
     viewpoint : (3,) float, or one for each view, optional
         Position of the cameras; estimated from the normals when not given. Views that looked at a right angle weigh
         most.

@@ -147,6 +147,7 @@ def complete(body: BodyModel | Subject, scan: Scan, landmarks: tuple[np.ndarray,
         Vertices of the template and their places on the scan: at least 3, better 4 to 10. Without them the search
         starts from typical poses in all orientations.
     config : CompletionConfig, optional
+        Settings.
     progress : callable, optional
         Called with (done, total).
     masked : (n,) bool, optional

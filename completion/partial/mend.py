@@ -8,7 +8,6 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
-from model.body import BodyModel
 from model.linear import Subject
 from scanprep.batch.opening import workspace
 from scanprep.batch.workspace import HOME, Workspace
@@ -80,7 +79,9 @@ class CompletionsApp(ResultsApp, CompleteApp):
         if scan.path not in self.made and (folder := self.output / self._name_of[scan.path]).exists():
             try:
                 done = load_completion(folder)
-                if _is_of(done, self.model):
+                # of this model: as many vertices, parts and betas
+                if len(done.completed.vertices) == len(self.model.template.vertices) and len(done.pose) == len(
+                        self.model.skeleton.parents) and (done.betas is None or len(done.betas) == self.model.n_betas):
                     self._keep(scan, done, folder)
             except ValueError as error:
                 self.note = str(error)
@@ -158,9 +159,3 @@ class CompletionsApp(ResultsApp, CompleteApp):
                         f"{self.plain.command} --interactive", made.seconds)
         self.saved[scan.path] = self.output / name
         self.note = f"saved in {self.output / name}; the page of the folder is new"
-
-
-def _is_of(done: Completion, model: BodyModel) -> bool:
-    """Tell whether a completion has the vertices, parts and betas of a model."""
-    return len(done.completed.vertices) == len(model.template.vertices) \
-        and len(done.pose) == len(model.skeleton.parents) and (done.betas is None or len(done.betas) == model.n_betas)

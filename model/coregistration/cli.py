@@ -89,6 +89,7 @@ def write_coregistered(folder: Path, first: BodyModel, tasks: Sequence[ScanTask]
         write_mesh(folder / mesh_file(task.name), r.mesh)
     done.model.skeleton.save(folder / "skeleton.json")
     write_landmarks(folder / "landmarks.json", first.info.get("landmarks", {}))
+    # figures of every registration, and the model of the last round
     figures = ("rms", "explained", "apart", "landmark_rms", "inverted", "starts")
     write_table(folder / "coregistration.csv", ["name", "good", *figures], [
         [task.name, bool(fine), *(getattr(r, figure) for figure in figures)]

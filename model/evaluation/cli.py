@@ -73,6 +73,7 @@ def evaluate(model: ModelArg, output: Output, poses: Path | None = None, shapes:
     _write_tables(output, loaded, found)
     with bar("drawing the page") as progress:
         page = evaluation_page(model.stem, loaded, found, [m for m in metrics if m.name != "note"], notes, progress)
+    # errors too large to be those of this model are a problem and not a result
     page.write(output / "report.html")
     measured = [(poses_found.errors, posed)] if poses_found is not None else []
     measured += [(shapes_found.errors[-1], people)] if shapes_found is not None else []

@@ -66,6 +66,7 @@ def _pose_section(page: Page, model: BodyModel, found: Findings) -> None:
                 "where the error lies: mean of all bodies, shown on the body at rest")
     page.bodies(extreme_panes(model, poses.errors, names, bodies, lambda i: poses.vertices(model, i), poses.poses),
                 "the best and the worst body: as given, then the fitted body coloured by its error")
+    # parts, the worst first
     parts = poses.errors.by_part
     page.table([(model.skeleton.names[p], MM * float(parts[:, p].mean()), MM * float(parts[:, p].max()),
                  names[int(parts[:, p].argmax())]) for p in np.argsort(-parts.mean(axis=0))],
@@ -76,6 +77,7 @@ def _shape_section(page: Page, model: BodyModel, found: Findings) -> None:
     shapes, bodies, names = found.shapes, found.shape_bodies, found.shape_names
     assert shapes is not None and bodies is not None
     page.section("People", "Of every person shape, pose and place were fitted, with more and more components.")
+    # the curve of generalisation: mean error by the number of components, and as a table
     figure, axes = _figure(7.0, 3.0)
     axes.plot(shapes.counts, [MM * e.overall for e in shapes.errors], "o-", label="shape, pose and place fitted")
     axes.plot(shapes.counts, [MM * e.overall for e in shapes.pose_held], "s--", color="0.45",
@@ -88,6 +90,7 @@ def _shape_section(page: Page, model: BodyModel, found: Findings) -> None:
     page.chart(figure, "mean over people and vertices")
     page.table(generalisation_rows(shapes), ("components", "fitted (mm)", "95th percentile (mm)", "worst vertex (mm)",
                                              "pose held (mm)", "vertex PCA (mm)"))
+    # with all components: where the error lies, and the best and the worst person
     last, count = shapes.errors[-1], int(shapes.counts[-1])
     rest = model.template.with_vertices(model.vertices(np.zeros_like(shapes.poses[0, 0]), np.zeros(1)))
     page.bodies([error_pane(rest, last.by_vertex, f"mean over the people, {count} components")],

@@ -125,6 +125,7 @@ def continuous_quaternions(R: np.ndarray) -> np.ndarray:
 
 
 def _primitive(glb: Glb, rig: Rig, targets: np.ndarray, material: Material | None, U: np.ndarray) -> dict[str, Any]:
+    # surface with morph targets, then skinning attributes and tangents of the normal map
     joints, weights = four_carriers(rig.weights)
     out = (glb.add_surface(rig.mesh, targets=targets) if material is None else
            glb.add_surface(rig.mesh, material.normals @ U, material.uv, targets))

@@ -162,6 +162,7 @@ def _prepare_view(scan: View, viewpoint: np.ndarray | None, name: str) -> ScanPo
     if not np.isfinite(points).all():
         bad = np.flatnonzero(~np.isfinite(points).all(axis=1))
         raise ValueError(f"{name}: {len(bad)} points are not finite, the first is point {bad[0]}")
+    # of a mesh, vertices with triangles count, and their normals are known
     index, border = distinct_places(points), np.zeros(len(points), dtype=bool)
     meshed = isinstance(scan, Mesh) and len(scan.faces) > 0
     if isinstance(scan, Mesh) and meshed:

@@ -15,7 +15,7 @@ from .marks import BodyLandmarks, body_landmarks
 from .section import Carried, SectionCurve, direction, mean_of, section, tape
 from .tapes import Extent, Found, Girth, Height, Span, Straight, Tapes, Way, Weight
 
-BAND = 0.10                          # metres along the surface, for 1.75 m: a tape stays this near to its template place
+BAND = 0.10                          # metres along the surface, for 1.75 m: a tape stays this near to its place
 
 
 class _NotThereError(ValueError):

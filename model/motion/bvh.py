@@ -256,6 +256,7 @@ def _read_motion(words: _Words, joints: list[_Joint], rate: float | None) -> tup
     wanted = sum(len(joint.channels) for joint in joints)
     if not wanted:
         raise StorageError(f"{words.path}: expected joints with channels, found {len(joints)} joints without")
+    # all numbers after the header, wherever the lines break
     first = words.line                                           # numbers begin on a line of their own
     rows = [(first + k + 1, line.split()) for k, line in enumerate(words.lines[first:]) if line.strip()]
     # programs may leave no blank between two numbers, the later one negative
@@ -266,6 +267,7 @@ def _read_motion(words: _Words, joints: list[_Joint], rate: float | None) -> tup
     if frames * len(joints) > 10**6 + 4 * sum(map(len, words.lines)):
         raise StorageError(f"{words.path}: expected frames of joints with channels, found {frames} frames of "
                            f"{len(joints)} joints with {wanted} channels")
+    # a wrong count: where most lines hold one frame, name the first line that does not
     if len(flat) != frames * wanted:                             # a frame may be broken into several lines
         odd = [(number, row) for number, row in rows if len(row) != wanted]
         if 0 < len(odd) < len(rows) / 2:

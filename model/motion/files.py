@@ -78,6 +78,7 @@ def read_motion_file(path: str | Path, more: Collection[str] = (), parts: int | 
         Missing, damaged, not finite, or no motion: which array, what was expected, what came.
     """
     path = Path(path)
+    # files of other programs are recognised by their ending: say what to do instead
     if path.suffix.lower() == ".bvh":
         raise StorageError(f"{path}: expected a motion (.npz), found BVH; scape animate {path.name} -m MODEL -o OUT "
                            "puts it on a model")
@@ -85,6 +86,7 @@ def read_motion_file(path: str | Path, more: Collection[str] = (), parts: int | 
         raise StorageError(f"{path}: expected a motion (.npz), found {OTHER_MOTIONS[path.suffix.lower()]}")
     what, wanted = "a motion (.npz)", (
         "poses", *_PLACES, "betas", *RATES, *(name for piece in _PIECES for name in piece), *more)
+    # only known arrays are read; poses in pieces are joined
     a = storage.load_arrays(path, what, wanted)
     for name in ("gender", "surface_model_type"):        # pickled objects in some files: these are skipped
         try:

@@ -130,6 +130,7 @@ def register_character(model: BodyModel, mesh: Mesh, landmarks: Mapping[str, np.
     if np.array_equal(mesh.faces, model.template.faces):
         body = mesh
     else:
+        # other triangles: the template is registered by landmarks of the same names
         known = model.info.get("landmarks", {}) if template_landmarks is None else template_landmarks
         _, vertices, points = match_landmarks(known, landmarks or {}, minimum=4)
         fit = _register_character(model.template, mesh, vertices.astype(np.int64), points, config, progress)

@@ -190,8 +190,8 @@ def judge_statue(statue: FittedStatue, scan: Mesh, finest: Level, left_out: Sequ
                       "given by hand (--features) may help")
     elif shares["folded"] > 0.06 or shares["measured"] < 0.75:
         check.append(f"{summary}; clothes and hair, a part of a person, or joints in wrong places: look at the page")
-    # share of the scan farther off than a hundredth of its size: right statues have up to 0.003, one in a coat 0.027, an
-    # arm clicked on the trunk 0.13, clicks of half the size 0.41
+    # share of the scan farther off than a hundredth of its size: right statues have up to 0.003, one in a coat 0.027,
+    # an arm clicked on the trunk 0.13, clicks of half the size 0.41
     if missed > 0.02:
         (failed if missed > 0.25 else check).append(
             f"{100 * missed:.0f}% of the scan lies off the statue: joints in wrong places, or more than a person?")
@@ -327,8 +327,8 @@ def animate(statue: StatueArg, motion: MotionArg, output: Output, model: Path | 
             for t, body in enumerate(bodies):
                 write_mesh(output / "meshes" / f"{t:05d}.ply", detailed.mesh(body))
                 progress(t + 1, len(bodies))
-    # share of inverted triangles in a frame: 100 poses of people have up to 0.002, a real walk 0.005; random joint angles
-    # have 0.010, a walk with degrees read as radians 0.012
+    # share of inverted triangles in a frame: 100 poses of people have up to 0.002, a real walk 0.005; random joint
+    # angles have 0.010, a walk with degrees read as radians 0.012
     inverted = [len(find_inverted(control, body, fine, detailed(body))) for body in shown]
     share = max(inverted) / len(fine.faces)
     doubts = [f"{100 * share:.1f}% of the triangles are inverted in a frame: the pose is beyond what the skin can "

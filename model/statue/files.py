@@ -183,6 +183,7 @@ def write_statue_glb(path: str | Path, control: ControlModel, vertices: np.ndarr
     if np.shape(vertices) != (len(subdivision.parent), 3):
         raise ValueError(f"vertices: expected shape ({len(subdivision.parent)}, 3), got {np.shape(vertices)}")
     mesh, chart = Mesh(vertices, subdivision.faces), subdivision.chart
+    # blend weights of the fine vertices are interpolated; vertices repeat along the seams of the chart
     weights = np.einsum("nc,ncj->nj", subdivision.bary, control.weights[control.mesh.faces[subdivision.parent]])
     row = vertex_of_row(mesh, chart)                            # vertices are repeated along the seams of the chart
     split = Mesh(mesh.vertices[row], chart.faces)
@@ -248,18 +249,18 @@ def _skin(person: ElementTree.Element, mesh: Mesh, chart: Chart, image: str | No
     def corners(faces: np.ndarray) -> str:
         return " ".join(f"{a} {b} {c} -1" for a, b, c in faces)
 
-    ElementTree.SubElement(person, "Coordinate", DEF="skin_points", containerField="skinCoord", point=rows(mesh.vertices))
-    ElementTree.SubElement(person, "Normal", DEF="skin_normals", containerField="skinNormal", vector=rows(mesh.vertex_normals))
-    shape = ElementTree.SubElement(person, "Shape", containerField="skin")
-    look = ElementTree.SubElement(shape, "Appearance")
-    ElementTree.SubElement(look, "Material", diffuseColor="0.8 0.77 0.74" if image is None else "1 1 1")
+    child = ElementTree.SubElement
+    child(person, "Coordinate", DEF="skin_points", containerField="skinCoord", point=rows(mesh.vertices))
+    child(person, "Normal", DEF="skin_normals", containerField="skinNormal", vector=rows(mesh.vertex_normals))
+    shape = child(person, "Shape", containerField="skin")
+    look = child(shape, "Appearance")
+    child(look, "Material", diffuseColor="0.8 0.77 0.74" if image is None else "1 1 1")
     if image is not None:
-        ElementTree.SubElement(look, "ImageTexture", url=f'"{image}"', repeatS="false", repeatT="false")
-    surface = ElementTree.SubElement(shape, "IndexedFaceSet", coordIndex=corners(mesh.faces),
-                             texCoordIndex=corners(chart.faces))
-    ElementTree.SubElement(surface, "Coordinate", USE="skin_points")
-    ElementTree.SubElement(surface, "Normal", USE="skin_normals")
-    ElementTree.SubElement(surface, "TextureCoordinate", point=rows(chart.uv))
+        child(look, "ImageTexture", url=f'"{image}"', repeatS="false", repeatT="false")
+    surface = child(shape, "IndexedFaceSet", coordIndex=corners(mesh.faces), texCoordIndex=corners(chart.faces))
+    child(surface, "Coordinate", USE="skin_points")
+    child(surface, "Normal", USE="skin_normals")
+    child(surface, "TextureCoordinate", point=rows(chart.uv))
 
 
 def _row(values: np.ndarray) -> str:

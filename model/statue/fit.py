@@ -129,11 +129,13 @@ def fit_statue(scan: Mesh, joints: Mapping[str, np.ndarray] | None = None,
     """
     control, config, scan = control or humanoid(), config or StatueConfig(), sanitise(scan)
     inputs = (scan, joints, points, control)
+    # 1. pose the control model by features, which are found if none are given
     if joints is None and points is None:
         features = step("features", inputs, lambda: find_features(control, scan))
         posed = pose_automatically(control, features, config.start == "registered")                # [Statues] Eq. 4-5
     else:
         posed = pose_by_features(control, joints or {}, points or {})                           # [Statues] Eq. 1-5
+    # 2. fit the control mesh to the scan, open its folds, and measure what is left as a displacement map
     surface = step("surface", (inputs, config), lambda: fit_surface(
         control.mesh, posed.start, scan, config.surface, progress, posed.hidden))                # [Statues] Eq. 6-18
     fitted = step("control", (inputs, config), lambda: fit_control(

@@ -25,12 +25,12 @@ from .detail.subdivision import subdivide_uniform
 from .motion.motions import people_motion
 
 HEIGHT = 520                         # pixels of the pictures
-MOVED = MOST // 2                    # triangles of one of several bodies beside each other
+MOVED = MOST // 2                    # triangles of a body that is shown beside others
 KINDS = {MEASURED: (0.62, 0.70, 0.78), FOLDED: (0.86, 0.36, 0.22), HOLE: (0.93, 0.75, 0.42), OUTSIDE: (1.0, 1.0, 1.0)}
 
 
 def cameras(statue: Statue, subject: Any, turns: Sequence[float] = (0, 90, 180, 270)) -> list[Camera]:
-    """Cameras around a subject (Mesh or points) from the front on; the front is where the control model looks."""
+    """Place cameras around a subject (Mesh or points), from the front on, where the control model looks."""
     front, axis = -statue.control.skeleton.part_rotations(statue.pose)[0][:, 1], statue.upright_axis
     first, second = np.eye(3)[[(axis + 1) % 3, (axis + 2) % 3]]
     azimuth = float(np.degrees(np.arctan2(front @ second, front @ first)))
@@ -38,14 +38,14 @@ def cameras(statue: Statue, subject: Any, turns: Sequence[float] = (0, 90, 180, 
 
 
 def statue_picture(scan: Mesh, statue: Statue, level: Level) -> np.ndarray:
-    """Scan, control mesh and reconstruction from the front, and the scan and the reconstruction from behind."""
+    """Picture scan, control mesh and reconstruction from the front, and scan and reconstruction from behind."""
     back, = cameras(statue, scan, (200,))
     bare, control, made = first_panes(scan, statue, level)
     return picture_panes([bare, control, made, replace(bare, camera=back), replace(made, camera=back)], HEIGHT)
 
 
 def first_panes(scan: Mesh, statue: Statue, level: Level) -> list[Pane]:
-    """Scan, control mesh in the colours of its parts, and reconstruction."""
+    """Draw the scan, the control mesh in the colours of its parts, and the reconstruction."""
     camera, = cameras(statue, scan, (20,))
     coverage = np.array([KINDS[kind] for kind in coverage_of_vertices(statue)])
     control = Solid(statue.control.mesh, part_colors(statue.control.skeleton.part_of_face), smooth=False,
@@ -56,7 +56,7 @@ def first_panes(scan: Mesh, statue: Statue, level: Level) -> list[Pane]:
 
 def statue_page(name: str, scan: Mesh, statue: Statue, levels: Sequence[Level], metrics: Sequence[Metric],
                 adaptive: Level, frames: Sequence[tuple[str, Mesh]], picture: np.ndarray) -> Page:
-    """The page of `scape statue fit`: levels, coarsest first, the figures, the statue in other poses."""
+    """Make the page of `scape statue fit`: levels, coarsest first, the figures, the statue in other poses."""
     page = Page(f"{name}, a statue that moves", "A control mesh with a skeleton was fitted to the scan; the detail of "
                 "the scan is an image over it.")
     thinned = "Shown with fewer triangles than it has."
@@ -108,13 +108,13 @@ def statue_page(name: str, scan: Mesh, statue: Statue, levels: Sequence[Level], 
 
 
 def coverage_of_vertices(statue: Statue) -> np.ndarray:
-    """(N,) what the map says at each vertex of the control mesh: MEASURED, FOLDED or HOLE."""
+    """Look up the coverage (N,) at each vertex of the control mesh: MEASURED, FOLDED or HOLE."""
     whole = subdivide_uniform(statue.control.mesh, statue.control.chart, 0)
     return coverage_at(statue.control, statue.map, whole.parent, whole.bary)
 
 
 def parts_without_data(statue: Statue) -> list[str]:
-    """Names of the parts of which less than half was measured."""
+    """List the names of the parts that are holes by more than half."""
     kind = coverage_of_vertices(statue)
     part = statue.control.skeleton.part_of_vertex(statue.control.mesh)
     hole = np.bincount(part, kind == HOLE) / np.maximum(np.bincount(part), 1)
@@ -122,7 +122,7 @@ def parts_without_data(statue: Statue) -> list[str]:
 
 
 def in_motion(statue: Statue) -> list[tuple[str, Mesh]]:
-    """The statue in a walk, a squat and with its arms overhead; none for a control model with other joints."""
+    """Pose the statue in a walk, a squat and with its arms overhead; none for a control model with other joints."""
     if statue.control.skeleton.names != humanoid().skeleton.names:
         return []
     poses = np.stack([synthesise_walk(80)[0][20], find_pose("squat"), find_pose("arms_up")])
@@ -136,7 +136,7 @@ def in_motion(statue: Statue) -> list[tuple[str, Mesh]]:
 
 def motion_pictures(statue: Statue, detailed: Reconstruction, bodies: np.ndarray,
                     progress: Callable[[int, int], None] | None = None) -> list[np.ndarray]:
-    """A picture of each of some frames of control vertices (T, N, 3), all seen from one place in front."""
+    """Picture frames of control vertices (T, N, 3), all from one camera in front."""
     camera, out = cameras(statue, bodies.reshape(-1, 3), (25,))[0], []
     for t, body in enumerate(bodies):
         out.append(render(detailed.mesh(body), camera, int(360 * camera.width / camera.height) + 10, 360))

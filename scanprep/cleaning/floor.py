@@ -7,7 +7,7 @@ import numpy as np
 from scipy import ndimage
 from scipy.spatial import cKDTree
 
-WIDEST = 0.03              # metres: half-width of the band around a first guess; scanned floors are flatter
+WIDEST = 0.03              # metres: half-width of the band around a first guess
 SIGMAS = 3.5               # points within so many standard deviations are on the floor: 99.95% of Gaussian noise
 
 

@@ -63,6 +63,7 @@ def find_correspondences(template: Mesh, scan: Mesh | np.ndarray, seeds: tuple[n
 
     Examples
     --------
+    >>> from scanprep.correspondence.search import BeliefLevel
     >>> from scanprep.synthetic.people import SyntheticPerson, find_pose
     >>> person = SyntheticPerson()
     >>> scan = person.in_pose(find_pose("run"))

@@ -35,6 +35,12 @@ class Correspondences:
         What was minimised, and other figures of the search.
     converged : bool
         Belief propagation converged, and the matching of limb ends was clear.
+
+    Examples
+    --------
+    >>> pairs = Correspondences(np.array([3, 8]), np.zeros((2, 3)), np.array([1.0, 0.4]))
+    >>> len(pairs), pairs.template_vertices[pairs.confidence > 0.5].tolist()
+    (2, [3])
     """
 
     template_vertices: np.ndarray

@@ -175,7 +175,7 @@ def camera_file(picture: Path) -> Path:
     return picture.with_name(picture.stem + CAMERA)
 
 
-def read_depth(path: Path, metres: float = 0.001) -> DepthPicture:
+def read_depth(path: str | Path, metres: float = 0.001) -> DepthPicture:
     """Read a depth picture from a 16-bit PNG file.
 
     The camera is read from `NAME.camera.json` beside it: `{"fx", "fy", "cx", "cy"}` in pixels, or
@@ -183,7 +183,7 @@ def read_depth(path: Path, metres: float = 0.001) -> DepthPicture:
 
     Parameters
     ----------
-    path : Path
+    path : str or Path
         PNG file with one channel of 16 bits, 0 where nothing was measured.
     metres : float
         Length of one unit of the file.
@@ -200,14 +200,14 @@ def read_depth(path: Path, metres: float = 0.001) -> DepthPicture:
 
     Examples
     --------
-    >>> import tempfile
+    >>> from pathlib import Path
     >>> from PIL import Image
-    >>> folder = Path(tempfile.mkdtemp())
-    >>> Image.fromarray(np.full((8, 8), 1500, dtype=np.uint16)).save(folder / "a.png")
-    >>> _ = (folder / "a.camera.json").write_text('{"fx": 10, "fy": 10, "cx": 3.5, "cy": 3.5}')
-    >>> float(read_depth(folder / "a.png").depth[0, 0])
+    >>> Image.fromarray(np.full((8, 8), 1500, dtype=np.uint16)).save("a.png")
+    >>> _ = Path("a.camera.json").write_text('{"fx": 10, "fy": 10, "cx": 3.5, "cy": 3.5}')
+    >>> float(read_depth("a.png").depth[0, 0])
     1.5
     """
+    path = Path(path)
     values = read_distances(path)
     try:
         return DepthPicture.of(metres * values, read_camera(camera_file(path)))

@@ -134,10 +134,8 @@ def read_mesh(path: str | Path, unit: str | None = None) -> Mesh:
 
     Examples
     --------
-    >>> import tempfile
-    >>> path = Path(tempfile.mkdtemp()) / "triangle.ply"
-    >>> write_mesh(path, Mesh([[0, 0, 0], [1, 0, 0], [0, 1, 0]], [[0, 1, 2]]))
-    >>> read_mesh(path, unit="m").vertices.shape
+    >>> write_mesh("triangle.ply", Mesh([[0, 0, 0], [1, 0, 0], [0, 1, 0]], [[0, 1, 2]]))
+    >>> read_mesh("triangle.ply", unit="m").vertices.shape
     (3, 3)
     """
     path = Path(path)
@@ -204,10 +202,9 @@ def write_mesh(path: str | Path, mesh: Mesh, precision: Precision = "double") ->
 
     Examples
     --------
-    >>> import tempfile
-    >>> path = Path(tempfile.mkdtemp()) / "triangle.obj"
-    >>> write_mesh(path, Mesh([[0, 0, 0], [1, 0, 0], [0, 1, 0]], [[0, 1, 2]]))
-    >>> path.exists()
+    >>> from pathlib import Path
+    >>> write_mesh("triangle.obj", Mesh([[0, 0, 0], [1, 0, 0], [0, 1, 0]], [[0, 1, 2]]))
+    >>> Path("triangle.obj").exists()
     True
     """
     _write(Path(path), Contents(mesh.vertices, mesh.faces, None, mesh.colors), precision, _MESHES)
@@ -246,10 +243,9 @@ def read_points(path: str | Path, unit: str | None = None) -> PointCloud:
 
     Examples
     --------
-    >>> import tempfile
-    >>> path = Path(tempfile.mkdtemp()) / "cloud.xyz"
-    >>> _ = path.write_text("0 0 0\\n0.5 0 0\\n0 1.7 0\\n")
-    >>> read_points(path, unit="m").points.shape
+    >>> from pathlib import Path
+    >>> _ = Path("cloud.xyz").write_text("0 0 0\\n0.5 0 0\\n0 1.7 0\\n")
+    >>> read_points("cloud.xyz", unit="m").points.shape
     (3, 3)
     """
     path = Path(path)

@@ -14,7 +14,7 @@ import numpy as np
 from ..words import number_of
 from . import storage
 
-FARTHEST = 1e9                       # largest coordinate in any unit; beyond it squares lose all digits
+FARTHEST = 1e9                       # largest coordinate in any unit; no scan has more
 UNITS = {"m": 1.0, "mm": 1e-3, "cm": 1e-2, "in": 0.0254}
 _SPELLED = {"metres": "m", "meters": "m", "millimetres": "mm", "millimeters": "mm", "centimetres": "cm",
             "centimeters": "cm", "inches": "in"}

@@ -56,10 +56,8 @@ def read_landmarks(path: str | Path, mesh: Mesh | np.ndarray | None = None, unit
 
     Examples
     --------
-    >>> import tempfile
-    >>> path = Path(tempfile.mkdtemp()) / "scan.json"
-    >>> write_landmarks(path, {"navel": np.array([0.0, 0.1, 1.0])})
-    >>> read_landmarks(path)["navel"].tolist()
+    >>> write_landmarks("scan.json", {"navel": np.array([0.0, 0.1, 1.0])})
+    >>> read_landmarks("scan.json")["navel"].tolist()
     [0.0, 0.1, 1.0]
     """
     path = Path(path)
@@ -90,10 +88,8 @@ def read_landmark_vertices(path: str | Path, mesh: Mesh, unit: str | None = None
 
     Examples
     --------
-    >>> import tempfile
-    >>> path = Path(tempfile.mkdtemp()) / "mesh.json"
-    >>> write_landmarks(path, {"tip": 1})
-    >>> read_landmark_vertices(path, Mesh([[0, 0, 0], [1, 0, 0], [0, 1, 0]], [[0, 1, 2]]))
+    >>> write_landmarks("mesh.json", {"tip": 1})
+    >>> read_landmark_vertices("mesh.json", Mesh([[0, 0, 0], [1, 0, 0], [0, 1, 0]], [[0, 1, 2]]))
     {'tip': 1}
     """
     path = Path(path)
@@ -169,10 +165,9 @@ def write_landmarks(path: str | Path, landmarks: Mapping[str, np.ndarray | int |
 
     Examples
     --------
-    >>> import tempfile
-    >>> path = Path(tempfile.mkdtemp()) / "scan.landmarks.json"
-    >>> write_landmarks(path, {"navel": np.array([0.0, 0.1, 1.0]), "left toe": 17})
-    >>> path.exists()
+    >>> from pathlib import Path
+    >>> write_landmarks("scan.landmarks.json", {"navel": np.array([0.0, 0.1, 1.0]), "left toe": 17})
+    >>> Path("scan.landmarks.json").exists()
     True
     """
     out: dict[str, Any] = {}

@@ -101,7 +101,7 @@ class OrientedPoints:
     """Nearest neighbours among points with compatible normals.
 
     Points and normals are searched together in six dimensions: the squared distance is |x - y|² + scale² |n - m|²
-    (scale in metres), so a point on the near side of a thin limb wins over a closer one on the far side.
+    (scale in metres). So a point on the near side of a thin limb wins over a closer one on the far side.
     """
 
     def __init__(self, points: np.ndarray, normals: np.ndarray, scale: float = 0.05) -> None:

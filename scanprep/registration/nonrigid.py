@@ -63,6 +63,15 @@ class Registration:
         Limbs were re-rolled by `repair_limbs`.
     soles : (float, float), metres, or None
         How far soles were beyond the end of the scan, before and after `with_soles`.
+
+    Examples
+    --------
+    >>> corners = np.array([[1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, 1], [0, 0, -1]])
+    >>> template = Mesh(corners, [[0, 2, 4], [2, 1, 4], [1, 3, 4], [3, 0, 4],
+    ...                           [2, 0, 5], [1, 2, 5], [3, 1, 5], [0, 3, 5]])
+    >>> fit = register(template, template.with_vertices(1.1 * template.vertices), config=RegistrationConfig.quick())
+    >>> fit.mesh.vertices.shape, fit.inverted
+    ((6, 3), 0)
     """
 
     mesh: Mesh

@@ -18,7 +18,7 @@ from .manifold import repair, split_vertices
 from .volumetric_diffusion import EMPTY, diffuse_surface
 
 Method = Literal["auto", "fair", "diffusion", "poisson-open3d", "poisson-pymeshlab"]
-MOST_EMPTY = 0.02                    # share of a good patch that may violate free space: noise of depth cameras
+MOST_EMPTY = 0.02                    # largest share of a good patch in free space; a worse one is tried again
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,7 @@ from ..geometry.mesh import Mesh
 from ..geometry.sparse import factor
 from ..geometry.surface import SeenSpace, Surface
 
-EMPTY = 0.01                         # metres in front of a seen surface from which on space is free; noise is smaller
+EMPTY = 0.01                         # metres in front of a seen surface from which on space counts as free
 
 
 def diffuse_surface(mesh: Mesh, rim: np.ndarray, seen: SeenSpace | None = None, voxels: int = 12) -> Mesh:

@@ -14,10 +14,10 @@ from .tree import Skeleton
 def name_parts(template: Mesh, skeleton: Skeleton, symmetry: Symmetry) -> tuple[str, ...]:
     """Name the parts of a person: pelvis, abdomen, chest, head, upper_arm_left, ..., foot_right.
 
-    A body counts as a person if it and its tree are symmetric, its middle parts form one chain, one pair of limbs
-    starts at the lower end and one further up, every limb is a chain, and the legs continue the trunk as in standing.
-    Beyond the arms the chain ends in a head. A head that never moves in the poses belongs to the chest. Left and right
-    follow from the feet: soles reach forward from the ankles. Any other body keeps its names.
+    A body counts as a person if it and its tree are symmetric and its middle parts form one chain. One pair of limbs
+    must start at the lower end and one further up. Every limb must be a chain, and the legs must continue the trunk as
+    in standing. Beyond the arms the chain ends in a head. A head that never moves in the poses belongs to the chest.
+    Left and right follow from the feet: soles reach forward from the ankles. Any other body keeps its names.
     """
     person = _person(template, skeleton, symmetry) if symmetry.holds else None
     if person is None:

@@ -93,8 +93,8 @@ def cases(model_file, motion_file, folder):
 
 
 def with_fbx(asked, cases, folder):
-    """The cases with the FBX file that Blender makes of a GLB, by the command of model/README.md."""
-    told = (Path(__file__).parents[2] / "model/README.md").read_text()
+    """The cases with the FBX file that Blender makes of a GLB, by the command of the documentation."""
+    told = (Path(__file__).parents[2] / ".docs/pages/methods/other-models.md").read_text()
     told = re.search(r'--python-expr "(.*?)"', told, re.S)[1].replace("fps = 30", f"fps = {asked.rate:g}")
     told = told.replace("walk.glb", "rerooted.glb").replace("walk.fbx", "rerooted.fbx")
     subprocess.run([asked.bpy, "-c", told], cwd=folder, check=True, stdout=subprocess.DEVNULL,

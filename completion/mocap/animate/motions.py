@@ -87,6 +87,7 @@ def judge_fit(fit: RetargetingError | None) -> Judgement:
 def transfer_figures(found: BodyMotion) -> list[Metric]:
     """Return figures of the retargeting: how it was done, and how well the body follows."""
     out = [Metric("frames", len(found.poses)), Metric("rate", found.rate, "1/s"), Metric("copied", found.how)]
+    # the rest pose of the other skeleton, and which parts follow which joints
     if found.rest:
         out.append(Metric("rest of its skeleton", found.rest))
     if found.brought is not None:
@@ -94,6 +95,7 @@ def transfer_figures(found: BodyMotion) -> list[Metric]:
                 Metric("travel scaled by", found.brought.scale)]
         if found.brought.lacking:
             out.append(Metric("parts without a joint in the motion", ", ".join(found.brought.lacking)))
+    # errors of joint centres and of the directions of segments
     if found.fit is not None:
         distance = MM * found.fit.distances
         out += [Metric(MEAN_DISTANCE, MM * found.fit.distance, "mm"),
@@ -109,6 +111,7 @@ def _joints(page: Page, motion: Motion, body: Subject, fit: RetargetingError, fo
     page.bodies([pane_with_dots(motion, body, fit.wanted, "joint centres of the motion", [*map(_words, fit.names)],
                                 True)],
                 "Press the triangle to play, drag the body to turn it; it is kept in the middle.", 520)
+    # distances over time, the worst frames, and a table by segment
     page.section("Joint centres").chart(chart_residuals(motion, "joint centres"),
                                         "distance of the body's joint centres from those of the motion")
     page.bodies(frame_panes(motion, body, fit.wanted, worst_frames(motion, 5)), "where they are farthest off", 300)

@@ -187,6 +187,7 @@ def write_virtual(path: str | Path, artefacts: MarkerArtefacts, original: str | 
     """
     path, sequence = Path(path), artefacts.virtual()
     filled = ~artefacts.repaired.seen
+    # other formats have no room for what a C3D tells of computed points
     if path.suffix.lower() != ".c3d":
         write_markers(path, sequence)
         return

@@ -58,6 +58,7 @@ class MarkerSequence:
         if positions.ndim != 3 or positions.shape[1:] != (len(labels), 3):
             raise ValueError(f"positions: expected shape (T, {len(labels)}, 3) for {len(labels)} labels, "
                              f"got {positions.shape}")
+        # no label twice, a positive rate, no infinite position
         twice = [label for label, times in Counter(labels).items() if times > 1]
         if twice:
             raise ValueError(f"labels: expected each once, {', '.join(twice)} comes more often")
@@ -65,6 +66,7 @@ class MarkerSequence:
             raise ValueError(f"rate: expected a positive number of frames per second, got {self.rate}")
         if np.isinf(positions).any():
             raise ValueError("positions: expected finite numbers, or NaN for a marker that was not seen")
+        # a marker with one missing coordinate is missing; stored arrays are read-only
         positions[np.isnan(positions).any(axis=2)] = np.nan
         positions.flags.writeable = False
         object.__setattr__(self, "positions", positions)
@@ -233,6 +235,7 @@ def marker_subjects(path: str | Path) -> tuple[str, ...]:
     people = tuple(prefixes[0] for prefixes in people_of(labels) if len(prefixes) == 1)
     if len(people) < 2:
         return people
+    # labels of each prefix; a prop has few, and none in common with a person
     bare = {who: {label.rpartition(":")[2] for label in labels if label.rpartition(":")[0] == who} for who in people}
     times = Counter(label for own in bare.values() for label in own)
     props = [who for who, own in bare.items() if len(own) < 8 and all(times[label] == 1 for label in own)]
@@ -291,6 +294,7 @@ def subject_columns(path: Path, labels: Sequence[str], subject_prefix: str | Non
     if subject_prefix is None and len(people) > 1:
         raise MarkerFileError(f"{path}: expected one subject, found {', '.join(who for who, in people)}; say "
                               f"subject_prefix={people[0][0]}")
+    # without a prefix all labels; a prefix may itself contain a comma
     wanted = known | {""} if subject_prefix is None else \
         {subject_prefix} if subject_prefix in known else set(subject_prefix.split(","))
     missing = wanted - known - {""}

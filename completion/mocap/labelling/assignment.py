@@ -46,11 +46,15 @@ def assign_by_places(points: np.ndarray, tracks: np.ndarray, known: np.ndarray, 
     Parameters
     ----------
     points : (T, C, 3) float, metres
+        Unlabelled points.
     tracks : (T, C) int
+        Track of each point, -1 without one.
     known : (T, C) int
-        As of `label_markers`.
+        As for `label_markers`.
     places : (T, L, 3) float, metres
+        Simulated markers.
     rate : float, frames per second
+        Of the points.
     sd : (L,) float, metres
         Standard deviation of each marker from its place, in each direction.
     """
@@ -109,6 +113,7 @@ def find_displaced(points: np.ndarray, columns: np.ndarray, places: np.ndarray, 
     Parameters
     ----------
     points : (T, C, 3) float, metres
+        Labelled and unlabelled points.
     columns : (T, L) int
         Columns of the labelled markers.
     places : (T, L, 3) float, metres

@@ -71,6 +71,7 @@ def label_recordings(markers: MarkersArg, output: Output, model: ModelOrNone = N
                          "--labels is that of one recording")
     loaded, name = read_model(model)
     body = loaded if subject == "markers" else body_of(loaded, subject, unit)
+    # what all recordings share, then a folder of recordings, one recording into a folder, or into a file
     work = LabelWork(loaded, name, body if isinstance(body, Subject) else None,
                      None if layout is None else layout_or_file(layout), people, labels, relabel, unit, rate)
     settings = {"model": name, "layout": layout, "people": people, "relabel": relabel}
@@ -86,7 +87,7 @@ def label_recordings(markers: MarkersArg, output: Output, model: ModelOrNone = N
 
 def _label_folder(markers: Path, work: LabelWork, space: AnyWorkspace, workers: Workers, settings: Mapping[str, Any]
                   ) -> Outcome:
-    """Every recording of a folder into a folder of its name."""
+    """Label every recording of a folder into a folder of its name."""
     found = list_files(markers, lambda path: path.suffix.lower() in READERS, f"files ending in {', '.join(READERS)}")
     names = [path.stem for path in found]
     if twice := sorted({name for name in names if names.count(name) > 1}):      # written over each other
@@ -98,7 +99,7 @@ def _label_folder(markers: Path, work: LabelWork, space: AnyWorkspace, workers: 
 
 
 def _summary(results: Results, count: int) -> list[Metric]:
-    """The rows of the closing table."""
+    """Return the rows of the closing table."""
     rows = [Metric("recordings", count), Metric("done before", len(results.values) - len(results.fresh)),
             Metric("failed", len(results.failures))]
     for name in (LABELLED_SHARE, DOUBTFUL) if results.values else ():

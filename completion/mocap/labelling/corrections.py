@@ -20,6 +20,8 @@ def write_labels(path: Path, points: Sequence[str], tracks: np.ndarray, rows: np
 
     Parameters
     ----------
+    path : Path
+        CSV file to write.
     points : C strings
         Names of the columns of the recording.
     tracks : (T, C) int

@@ -1,4 +1,4 @@
-"""A body followed through points without names: key frames are solved, and vote which track is which marker."""
+"""Follow bodies through unlabelled points: key frames are solved, and vote for the labels of tracks."""
 from __future__ import annotations
 
 from collections import deque
@@ -10,15 +10,18 @@ import numpy as np
 from .body_search import ALONE, JUDGED, BodySearch, Placement, assign_columns, robust_weights
 
 EVERY = 0.1                          # seconds between key frames
-GOOD = 0.7                           # share of markers within 10 cm, below which the body is sought anew
-BETTER = 0.2                         # markers of misfit that a new start has to gain; a turned foot costs 0.3 to 1
-WAIT, LONGEST = 0.5, 2.0             # seconds from a search that found nothing better to the next, doubled each time
+GOOD = 0.7                           # share of markers within 10 cm below which the body is searched from scratch
+BETTER = 0.2                         # misfit that a new start has to gain, in markers; a reversed foot costs 0.3 to 1
+WAIT, LONGEST = 0.5, 2.0             # seconds from a search without success to the next, doubled up to LONGEST
 
 
 @dataclass(frozen=True)
 class Scales:
-    """How far points lie from the markers of a body, metres: as a solution is judged, in successive rounds of matches,
-    and from where the marker was on the body in the key frame before."""
+    """Scales, metres, of the distances of points from markers.
+
+    `judged` is for the judgement of a solution, `matches` for successive rounds of matches, `held` for the distance
+    from the marker's offset in the key frame before.
+    """
 
     judged: float
     matches: tuple[float, ...]
@@ -26,13 +29,13 @@ class Scales:
 
 
 MEAN_PERSON = Scales(JUDGED, (0.15, 0.12), 0.06)
-# of the person who was found, with markers as worn: 0.08 as above exchanged a foot's markers in 2 of 4 recordings
+# for the fitted person; 0.08 for `judged`, as above, exchanged the markers of a foot in 2 of 4 recordings
 OWN_PERSON = Scales(0.04, (0.12, 0.06), 0.04)
 
 
 @dataclass(frozen=True, eq=False)
 class KeyFrame:
-    """The points (N, 3) of a frame, metres, their tracks (N,), and what is known of them (N,) as of `label_markers`."""
+    """The points (N, 3) of a frame, metres, their tracks (N,), and known labels (N,) as in `label_markers`."""
 
     points: np.ndarray
     tracks: np.ndarray
@@ -41,7 +44,7 @@ class KeyFrame:
 
 @dataclass(frozen=True, eq=False)
 class Solution:
-    """A body in a key frame.
+    """The solution of a body in a key frame.
 
     Attributes
     ----------
@@ -50,9 +53,9 @@ class Solution:
     matches : (L,) int
         The point of each marker, -1 without one.
     off : (L, 3) float, metres
-        Where the point of each marker is from its place on the body; of one without a point, where it was before.
+        Offset of the point of each marker from its place on the body; the last one for a marker without a point.
     total : float
-        Misfit, in markers without a point.
+        Misfit, multiplied by the number of markers.
     """
 
     x: np.ndarray
@@ -62,17 +65,17 @@ class Solution:
 
     @property
     def strain(self) -> float:
-        """What the markers that have a point cost."""
+        """Cost of the markers that have a point."""
         return self.total - ALONE * float((self.matches < 0).sum())
 
     @property
     def near(self) -> np.ndarray:
-        """(L,) distance of each marker's point from its place, metres; infinite without one."""
+        """Distance (L,) of each marker's point from its place, metres; infinite without one."""
         return np.where(self.matches >= 0, np.linalg.norm(self.off, axis=1), np.inf)
 
     def labels(self, tracks: np.ndarray) -> dict[int, int]:
-        """Track -> marker, of those near their place."""
-        # metres from its place beyond which no point keeps a label
+        """Return track -> marker, for markers near their place."""
+        # 0.15: metres from its place beyond which a point loses its label
         return {int(tracks[self.matches[row]]): int(row) for row in np.flatnonzero(self.near < 0.15)}
 
 
@@ -81,7 +84,7 @@ Solutions = tuple[Solution, ...]     # of each person
 
 def key_frames(points: np.ndarray, tracks: np.ndarray, known: np.ndarray, rate: float, first: int
                ) -> tuple[np.ndarray, list[KeyFrame]]:
-    """The frames (K,) that are solved, `first` among them, and their points."""
+    """Return the key frames (K,), `first` among them, and their points."""
     every = max(1, round(EVERY * rate))
     times = np.arange(first % every, len(points), every)
     seen = [np.flatnonzero(tracks[t] >= 0) for t in times]
@@ -90,11 +93,11 @@ def key_frames(points: np.ndarray, tracks: np.ndarray, known: np.ndarray, rate: 
 
 def follow_keys(searches: Sequence[BodySearch], keys: Sequence[KeyFrame], begin: int, placements: Sequence[Placement],
                 tell: Callable[[int], None]) -> list[Solutions | None]:
-    """The people in every key frame, from the one in which they were found both ways.
+    """Solve the people in every key frame, forwards and backwards from the frame `begin` in which they were found.
 
-    Tracks that go on keep their label and carry it along; the rest are matched with what is left, of all people at
-    once. Limbs, and a body that has lost the points, are sought anew now and then, and where the body fits worse than
-    before. Where key frames side by side disagree about the label of a track, each is tried from the other.
+    Tracks that continue keep their labels; other points are matched with the remaining markers of all people. Limbs,
+    and a body that has lost its points, are searched again now and then, and where the fit gets worse. Where successive
+    key frames disagree about the label of a track, each is solved again from the other.
     """
     solver = _KeyFrameSolver(searches, MEAN_PERSON)
     found: list[Solutions | None] = [None for _ in keys]
@@ -113,6 +116,7 @@ def follow_keys(searches: Sequence[BodySearch], keys: Sequence[KeyFrame], begin:
                 continue
             after = solver.carry([before], [held], [keys[i]])[0]
             for k in range(N):
+                # search limbs and body again after the waiting time, or when the fit is worse than usual
                 if quiet[k] > 0 and after[k].strain <= usual[k] + BETTER:
                     continue
                 new = solver.start_anew(after, k, keys[i])
@@ -126,10 +130,11 @@ def follow_keys(searches: Sequence[BodySearch], keys: Sequence[KeyFrame], begin:
 
 def solve_again(searches: Sequence[BodySearch], keys: Sequence[KeyFrame], found: Sequence[Solutions | None],
                 labels: np.ndarray) -> list[Solutions | None]:
-    """The same for the people who were found, from solutions of other bodies and the labels (K,) of tracks, -1 without.
+    """Solve key frames for fitted people, from solutions of other bodies and labels (K,) of tracks, -1 without.
 
-    All key frames are solved together; limbs are sought anew where the body fits worse than it usually does.
+    All key frames are solved together; limbs are searched again where the body fits worse than usual.
     """
+    # all solved key frames again, with offsets forgotten and labels by track
     solver = _KeyFrameSolver(searches, OWN_PERSON)
     solved = {i: solutions for i, solutions in enumerate(found) if solutions is not None}
     some = list(solved)
@@ -142,7 +147,7 @@ def solve_again(searches: Sequence[BodySearch], keys: Sequence[KeyFrame], found:
         for i in some:
             taken = sum(np.count_nonzero(one.matches >= 0) for one in now[i])
             lone = min(np.count_nonzero(now[i][k].matches < 0), len(keys[i].points) - taken)
-            # markers and points without each other, from which on limbs are sought anew
+            # search limbs where the fit is worse, or where 2 markers and 2 points have no partner
             if now[i][k].strain > usual + BETTER or (lone >= 2 and (i - last) * EVERY >= WAIT):
                 now[i], last = solver.start_anew(now[i], k, keys[i]), i
     again = [now.get(i) for i in range(len(keys))]
@@ -151,8 +156,10 @@ def solve_again(searches: Sequence[BodySearch], keys: Sequence[KeyFrame], found:
 
 
 def count_votes(keys: Sequence[KeyFrame], found: Sequence[Solutions | None], count: int) -> np.ndarray:
-    """How often the key frames that were solved gave each track each label (count, L + 1), the last column: none; L is
-    of all people."""
+    """Count how often key frames gave each track each label (count, L + 1), with L markers of all people.
+
+    The last column is for no label, which counts half. Frames with a bad fit do not vote for labels.
+    """
     sizes = next([len(one.matches) for one in solutions] for solutions in found if solutions is not None)
     ends = np.cumsum(sizes)
     votes = np.zeros((count, ends[-1] + 1))
@@ -169,20 +176,20 @@ def count_votes(keys: Sequence[KeyFrame], found: Sequence[Solutions | None], cou
 
 
 def _labels(solutions: Solutions, tracks: np.ndarray) -> list[dict[int, int]]:
-    """Track -> marker, of each person."""
+    """Return track -> marker for each person."""
     return [one.labels(tracks) for one in solutions]
 
 
 class _KeyFrameSolver:
-    """Bodies of some people in key frames, from those in others."""
+    """Solves the bodies of some people in key frames, from those in other key frames."""
 
     def __init__(self, searches: Sequence[BodySearch], scales: Scales) -> None:
         self.searches, self.scales = searches, scales
         ends = np.cumsum([search.body.count for search in searches]).tolist()
-        self.rows = list(zip([0, *ends[:-1]], ends, strict=True))       # of the markers of each person
+        self.rows = list(zip([0, *ends[:-1]], ends, strict=True))       # first and last row of each person's markers
 
     def place(self, x: Sequence[np.ndarray], key: KeyFrame) -> Solutions:
-        """The solution of unknowns (P,) of each person as they are."""
+        """Return the solution for given unknowns (P,) of each person."""
         out = []
         for search, one in zip(self.searches, x, strict=True):
             judged = search.judge(one, key.points, self.scales.judged)
@@ -191,10 +198,10 @@ class _KeyFrameSolver:
 
     def carry(self, before: Sequence[Solutions], held: Sequence[Sequence[dict[int, int]]], keys: Sequence[KeyFrame]
               ) -> list[Solutions]:
-        """The bodies of some key frames in others, each in one, where some tracks have a label of a person."""
+        """Carry solutions of key frames to other key frames, where some tracks have a label already."""
         unknowns = [self._lay_on_tracks(search, [solutions[k] for solutions in before], [of[k] for of in held], keys)
                     for k, search in enumerate(self.searches)]
-        # all points, matched with where the bodies have their markers and where they were on them before
+        # match all points with the simulated markers, and with their last offsets; then solve
         matches = np.full((len(keys), self.rows[-1][1]), -1)
         for scale in self.scales.matches:
             places = [search.body.positions(x) for search, x in zip(self.searches, unknowns, strict=True)]
@@ -206,17 +213,17 @@ class _KeyFrameSolver:
             for k, (search, (first, end)) in enumerate(zip(self.searches, self.rows, strict=True)):
                 targets = np.stack([_targets(key.points, m[first:end]) for key, m in zip(keys, matches, strict=True)])
                 unknowns[k] = _solve(search, unknowns[k], targets, scale)
-        out = []
+        solved = []
         for i, key in enumerate(keys):
-            out.append(tuple(
+            solved.append(tuple(
                 self._solution(search, unknowns[k][i], matches[i, first:end],
                                _others_hidden(key.points, np.delete(matches[i], np.s_[first:end])), before[i][k].off)
                 for k, (search, (first, end)) in enumerate(zip(self.searches, self.rows, strict=True))))
-        return out
+        return solved
 
     def _lay_on_tracks(self, search: BodySearch, before: Sequence[Solution], held: Sequence[dict[int, int]],
                        keys: Sequence[KeyFrame]) -> np.ndarray:
-        """Unknowns (K, P) of a body where the tracks that have a label put it."""
+        """Fit a body to the tracks that have a label; return unknowns (K, P)."""
         body, x = search.body, np.stack([solution.x for solution in before])
         targets = np.full((len(x), body.count, 3), np.nan)
         for target, labels, key in zip(targets, held, keys, strict=True):
@@ -224,6 +231,7 @@ class _KeyFrameSolver:
                 if int(track) in labels:
                     target[labels[int(track)]] = point
         there = np.isfinite(targets[..., 0])
+        # with 4 labelled points: move the body to them, then solve
         enough = there.sum(axis=1) >= 4
         if enough.any():
             n = body.body.n_angles
@@ -234,37 +242,37 @@ class _KeyFrameSolver:
 
     def _costs(self, places: np.ndarray, off: np.ndarray, held: dict[int, int], key: KeyFrame, scale: float
                ) -> np.ndarray:
-        """What each point (L, N) costs as each marker at places (L, 3), or where it was before."""
+        """Compute costs (L, N) of points as markers, by their places (L, 3) and by their last offsets."""
         cost = np.zeros((len(places), len(key.points)))
         for at, s in ((places, scale), (places + off, self.scales.held)):
             squared = ((at[:, None] - key.points)**2).sum(axis=-1)
             cost += 0.5 * squared / (squared + s**2)
         for j, track in enumerate(key.tracks):
             if int(track) in held:
-                # what a track that has a label costs less with it
+                # 0.3: bonus for a track that keeps its label
                 cost[held[int(track)], j] -= 0.3
         return cost
 
     def start_anew(self, solutions: Solutions, k: int, key: KeyFrame) -> Solutions:
-        """The solutions, or better ones with a limb or all of the body of person k sought anew."""
+        """Search a limb, or all of the body, of person k again; return the solutions, with k's if it is better."""
         search, scale, before = self.searches[k], self.scales.judged, solutions[k]
         others = np.concatenate([one.matches for j, one in enumerate(solutions) if j != k] or [np.empty(0, dtype=int)])
         points = _others_hidden(key.points, others)
         judged = search.judge(before.x, points, scale)
-        found = search.restart_limbs(judged, points, scale)
-        near = self._solution(search, found.x, found.matches, points, before.off).near
+        candidate = search.restart_limbs(judged, points, scale)
+        # the whole body if too few markers are near their points
+        near = self._solution(search, candidate.x, candidate.matches, points, before.off).near
         visible = points[np.isfinite(points[:, 0])]
         if (near < 0.1).sum() < GOOD * min(search.body.count, len(visible)) and len(visible) > 3:
             other = search.judge(search.find(visible).x, points, scale)
-            found = min(found, other, key=lambda one: one.misfit)
-        if (judged.misfit - found.misfit) * search.body.count < BETTER:
+            candidate = min(candidate, other, key=lambda one: one.misfit)
+        if (judged.misfit - candidate.misfit) * search.body.count < BETTER:
             return solutions
-        new = self._solution(search, found.x, found.matches, points, np.zeros_like(before.off))
+        new = self._solution(search, candidate.x, candidate.matches, points, np.zeros_like(before.off))
         return (*solutions[:k], new, *solutions[k + 1:])
 
     def reconcile(self, keys: Sequence[KeyFrame], found: list[Solutions | None]) -> None:
-        """Carry the solution of one of two key frames that give a track different labels into the other, if that gains.
-        """
+        """Carry the solution between successive key frames that disagree about a track, where that gains."""
         pairs = deque(range(len(keys) - 1))
         waiting = set(pairs)
         while pairs:
@@ -289,19 +297,20 @@ class _KeyFrameSolver:
 
     def _solution(self, search: BodySearch, x: np.ndarray, matches: np.ndarray, points: np.ndarray, off: np.ndarray
                   ) -> Solution:
-        """A solution; markers without a point keep where they were from their place, `off` (L, 3)."""
+        """Make a solution; markers without a point keep their last offset, `off` (L, 3)."""
         new = _targets(points, matches) - search.body.positions(x)
         total = search.judge(x, points, self.scales.judged).misfit * search.body.count
         return Solution(x, matches, np.where(np.isnan(new), off, new), total)
 
 
 def _solve(search: BodySearch, x: np.ndarray, targets: np.ndarray, scale: float) -> np.ndarray:
+    """Solve unknowns (K, P) for targets (K, L, 3), with robust weights of a scale."""
     weights = robust_weights(search.body.positions(x), targets, scale)
     return search.body.solve(x, targets, weights, 6, 1e-3).x
 
 
 def _others_hidden(points: np.ndarray, others: np.ndarray) -> np.ndarray:
-    """Points (N, 3) without those of some columns, which are NaN."""
+    """Return points (N, 3) with those of other people set to NaN."""
     if not len(others):
         return points
     points = points.copy()
@@ -310,17 +319,17 @@ def _others_hidden(points: np.ndarray, others: np.ndarray) -> np.ndarray:
 
 
 def forbid(cost: np.ndarray, known: np.ndarray) -> None:
-    """Raise costs (L, N) of matches that labels which are known (N,) forbid, in place."""
+    """Raise costs (L, N), in place, of matches that contradict known labels (N,)."""
     labelled = np.flatnonzero(known >= 0)
-    forced = 100.0  # cost of a match that a label which is known forbids
-    taken = cost[known[labelled], labelled] - forced                    # before its row and column are raised
+    forced = 100.0  # cost of a forbidden match, above all others
+    taken = cost[known[labelled], labelled] - forced                    # kept, as its row and column are raised
     cost[:, known != -1] += forced
     cost[known[labelled]] += forced
     cost[known[labelled], labelled] = taken
 
 
 def _targets(points: np.ndarray, matches: np.ndarray) -> np.ndarray:
-    """The point (L, 3) of each marker, NaN without one."""
+    """Return the point (L, 3) of each marker, NaN without one."""
     targets = np.full((len(matches), 3), np.nan)
     targets[matches >= 0] = points[matches[matches >= 0]]
     return targets

@@ -1,4 +1,4 @@
-"""A recording that is labelled before a command goes on with it: a step that is kept."""
+"""Label a recording as a first, kept step of another command."""
 from __future__ import annotations
 
 from dataclasses import dataclass
@@ -20,7 +20,7 @@ LABELLED, TABLE, PAGE = "labelled.c3d", "labels.csv", "labels.html"
 
 @dataclass(frozen=True)
 class LabelledFile:
-    """A labelled recording that was written, the unit by which it is read, and what its labels are worth."""
+    """A labelled recording: its file and markers, the unit to read it with, and the judgement of its labels."""
 
     path: Path
     markers: MarkerSequence
@@ -29,10 +29,10 @@ class LabelledFile:
 
 
 def label_first(room: TaskContext, name: str, path: Path, model: BodyModel | Subject, layout: MarkerLayout,
-                  unit: str | None, rate: float | None) -> LabelledFile:
-    """The recording with labels, NAME/labelled.c3d in the folder of a room.
+                unit: str | None, rate: float | None) -> LabelledFile:
+    """Label a recording into NAME/labelled.c3d in the folder of a task, with labels.csv and labels.html.
 
-    Beside it come labels.csv and labels.html. A step that is kept: what is done is not done again.
+    This is a kept step, which is not repeated for the same input.
     """
     def make(folder: Path) -> str:
         found = label_recording(path, read_marker_points(path, unit, rate), model, layout, progress=room.tell)
@@ -52,16 +52,16 @@ def label_first(room: TaskContext, name: str, path: Path, model: BodyModel | Sub
 
 
 def read_labelled(labelled: Path, source: Path, unit: str | None, rate: float | None) -> MarkerSequence:
-    """The markers of a labelled C3D that was made of a source, without the points that are none."""
+    """Read the markers of a labelled C3D that was made from a source, without other points."""
     return drop_unnamed(read_markers(labelled, _own_unit(source, unit), None, rate))
 
 
 def show_labels(page: Page) -> None:
-    """The way from a page to that of the labels, in the same folder."""
+    """Add a link to the page of the labels, in the same folder."""
     page.section("Labels", "The markers had no names. Which point is which marker was found first:")
     page.markup(f'<p><a href="{PAGE}">the labels, and where they are unsure</a></p>')
 
 
 def _own_unit(source: Path, unit: str | None) -> str | None:
-    """The unit by which a labelled C3D is read: a copy of a C3D says what that one said, rightly or wrongly."""
+    """Return the unit for reading a labelled C3D: a copy of a C3D has the same unit, right or wrong."""
     return unit if source.suffix.lower() == ".c3d" else None

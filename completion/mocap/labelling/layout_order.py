@@ -1,7 +1,7 @@
-"""Labels that were exchanged among the markers of one part of the body, all the time: told by the shape of the layout.
+"""Correct labels that were exchanged throughout among the markers of one part, by the shape of the layout.
 
-Four markers of a plate on a thigh lie closer to each other than the plate lies to its usual place. Which of them is
-which is not told by where they are, but by how they lie to each other.
+Four markers of a plate on a thigh are closer to each other than the plate is to its usual place. So their labels do not
+follow from their places, but from their arrangement.
 """
 from __future__ import annotations
 
@@ -9,21 +9,21 @@ import numpy as np
 from scipy.optimize import linear_sum_assignment
 from scipy.sparse.csgraph import connected_components
 
-ROUNDS = 10
+ROUNDS = 10                          # most alternations of shift and assignment
 
 
 def order_by_layout(places: np.ndarray, usual: np.ndarray, part: np.ndarray) -> np.ndarray:
-    """Which marker (L,) each of the markers truly is, if those of one part may bear each other's label.
+    """Return which marker (L,) each marker really is, if labels may be exchanged within a part.
 
-    The markers of a part may have moved together; of all orders the one is taken that leaves the least of the squared
-    distances from the usual places, where it is clearly better than the labels as they are.
+    The markers of a part may have moved together. The order with the least squared distances from the usual places is
+    taken, if it is clearly better than the present labels.
 
     Parameters
     ----------
     places : (L, 3) float, metres
-        Where the markers were found on the body at rest, NaN for those that were not.
+        Places of the markers on the body at rest, NaN for those that were not found.
     usual : (L, 3) float, metres
-        Where the layout has them.
+        Places of the layout.
     part : (L,) int
         The part of the body that carries each.
 
@@ -34,34 +34,33 @@ def order_by_layout(places: np.ndarray, usual: np.ndarray, part: np.ndarray) -> 
     [0, 3, 2, 1]
     """
     order = np.arange(len(places))
-    # markers of one part, then those that are near each other: a plate may lie over two parts
-    # metres between markers of one plate or hand
+    # groups: markers of one part, then chains of markers less than 10 cm apart, since a plate may span two parts
     _, plate = connected_components(np.linalg.norm(usual[:, None] - usual, axis=2) < 0.10)
-    gain = 0.5  # share of the squared distances that another order leaves at most
-    least = 0.015  # metres by which each marker that changes has to come closer, in the square mean
+    gain = 0.5  # another order has to leave less than that share of the squared distances
+    least = 0.015  # metres, root mean square, by which each changed marker has to come closer
     for group in (part, plate):
         at = np.full_like(places, np.nan)
-        at[order] = places                                             # under the labels they have by now
+        at[order] = places                                             # under the present labels
         change = np.arange(len(places))
         for of in np.unique(group):
-            mine = np.flatnonzero(group == of)
-            seen = mine[np.isfinite(at[mine, 0])]
+            members = np.flatnonzero(group == of)
+            seen = members[np.isfinite(at[members, 0])]
             if len(seen) < 3:
                 continue
-            as_it_is, _ = _least(at[seen], usual[mine], np.searchsorted(mine, seen), fixed=True)
-            best, chosen = min((_least(at[seen], usual[mine], start, fixed=False)
-                                for start in _starts(at[seen], usual[mine])), key=lambda one: one[0])
-            changed = int((mine[chosen] != seen).sum())
+            as_it_is, _ = _least(at[seen], usual[members], np.searchsorted(members, seen), fixed=True)
+            best, chosen = min((_least(at[seen], usual[members], start, fixed=False)
+                                for start in _starts(at[seen], usual[members])), key=lambda one: one[0])
+            changed = int((members[chosen] != seen).sum())
             if changed and best < gain * as_it_is and as_it_is - best > changed * least**2:
-                change[seen] = mine[chosen]
-                # labels that are given up go to the markers that lost theirs
-                change[np.setdiff1d(mine, seen)] = np.setdiff1d(mine, mine[chosen])
+                change[seen] = members[chosen]
+                # free labels go to the markers that lost theirs
+                change[np.setdiff1d(members, seen)] = np.setdiff1d(members, members[chosen])
         order = change[order]
     return order
 
 
 def _starts(places: np.ndarray, usual: np.ndarray) -> list[np.ndarray]:
-    """Orders to begin with: after every shift that brings one place to one of the usual ones."""
+    """Return initial orders: one for every shift that brings one place to a usual one."""
     starts = []
     for place in places:
         for goal in usual:
@@ -71,12 +70,11 @@ def _starts(places: np.ndarray, usual: np.ndarray) -> list[np.ndarray]:
 
 
 def _least(places: np.ndarray, usual: np.ndarray, chosen: np.ndarray, fixed: bool) -> tuple[float, np.ndarray]:
-    """The squared distances that an order leaves after the shift that suits it, and that order, improved if not fixed.
-    """
+    """Compute the squared distances of an order after its best shift; unless fixed, improve the order in turns."""
     cost = np.inf
     for _ in range(ROUNDS):
         shift = np.median(places - usual[chosen], axis=0)
-        # metres from its place, all markers of the part moved together, that still counts
+        # 0.15: metres beyond which the distance of a marker does not matter
         squared = np.minimum((((places - shift)[:, None] - usual)**2).sum(axis=-1), 0.15**2)
         better = chosen if fixed else linear_sum_assignment(squared)[1]
         cost = float(squared[np.arange(len(places)), better].sum())

@@ -1,4 +1,4 @@
-"""Limbs that do not fit their points any more: noticed by what they usually leave, and sought anew."""
+"""Notice limbs that fit their points worse than usual, and search them again."""
 from __future__ import annotations
 
 import numpy as np
@@ -7,11 +7,11 @@ from .body_search import ALONE, LIMB_ROUNDS, BodySearch, Placement
 from .follow_points import OWN_PERSON
 from .live_matching import find_unmatched
 
-WINDOW, LONG = 0.1, 2.0              # seconds over which strains are averaged, and what is usual
-# markers of strain above the usual at which a limb is sought: a foot turned about had 1.3 to 1.9, a right one below 0.8
+WINDOW, LONG = 0.1, 2.0              # seconds: time constants of the strain, and of the usual strain
+# strain above the usual, in markers, at which a limb is searched; a reversed foot had 1.3 to 1.9, a right one below 0.8
 WORSE = 0.8
-POSES = 8                            # of the limb that are tried, half of them with what follows the second joint alone
-PATIENCE, LONGEST = 0.25, 4.0        # seconds from a search that found nothing to the next, doubled up to the longest
+POSES = 8                            # poses tried for a limb, half of them only below its second joint
+PATIENCE, LONGEST = 0.25, 4.0        # seconds from a search without success to the next, doubled up to LONGEST
 
 
 class LimbWatch:
@@ -25,56 +25,55 @@ class LimbWatch:
     def __init__(self, search: BodySearch) -> None:
         self.search = search
         self.rows = [rows_of_limb(search, limb) for limb in search.limbs]
-        # all poses take their turn
+        # poses are tried in turn, in random order
         self.order, self.tries = search.poses[np.random.default_rng(0).permutation(len(search.poses))], 0
-        # markers, what is usual at first
+        # 0.5 markers: usual strain at the start
         self.usual = np.full(len(self.rows), 0.5)
         self.patience = np.full(len(self.rows), PATIENCE)
         self.begin()
 
     def begin(self) -> None:
-        """A body that was just found."""
-        # of each marker, 0 to 1: of the last frame, and on average
+        """Start with a body that was just found."""
+        # of each marker, 0 to 1: cost of the last frame, and its running mean
         self.cost, self.strain = np.zeros(self.search.body.count), np.zeros(self.search.body.count)
         self.quiet = np.zeros(len(self.rows))
 
     @property
     def mean_strain(self) -> float:
-        """Of all markers, 0 to 1."""
+        """Mean strain of all markers, 0 to 1."""
         return float(self.strain.mean())
 
     def update(self, points: np.ndarray, chosen: np.ndarray, places: np.ndarray, dt: float) -> None:
-        """The next frame: points (N, 3), the one of each marker (L,), and where the body has its markers (L, 3)."""
+        """Update strains: points (N, 3), the one of each marker (L,), and simulated markers (L, 3)."""
         there = chosen >= 0
         cost = np.zeros(len(chosen))
         squared = ((points[chosen[there]] - places[there])**2).sum(axis=1)
         cost[there] = squared / (squared + OWN_PERSON.judged**2)
-        # a marker without a point is a fault where a free point is near
+        # a marker without a point counts as a fault only where a free point is near, within 20 cm
         free = find_unmatched(len(points), chosen)
         if len(free) and not there.all():
             apart = ((points[free] - places[~there][:, None])**2).sum(axis=-1).min(axis=1)
-            # metres from its place within which a free point may be a marker's
             cost[~there] = np.where(apart < 0.2**2, ALONE, 0.0)
         self.cost = cost
         self.strain += (cost - self.strain) * min(1.0, dt / WINDOW)
         strain = self._of_limbs(self.strain)
-        # most markers by which a strain may lift what is usual
+        # 0.5: most by which one frame may exceed the usual strain when that is updated
         self.usual += (np.minimum(strain, self.usual + 0.5) - self.usual) * min(1.0, dt / LONG)
         self.quiet -= dt
 
     def doubtful(self) -> np.ndarray:
-        """Whether each marker (L,) is on a limb that fits worse than usual."""
+        """Return a mask (L,) of markers on limbs that fit worse than usual."""
         doubted = np.zeros(len(self.strain), dtype=bool)
         for rows, worse in zip(self.rows, self._of_limbs(self.strain) - self.usual, strict=True):
             doubted[rows] = worse > WORSE
         return doubted
 
     def seek(self, x: np.ndarray, points: np.ndarray) -> tuple[Placement, np.ndarray, list[int]] | None:
-        """A body that fits the points (N, 3) better with one limb from another pose, its markers and joints, or None.
+        """Search the worst limb in other poses; return a better body, and the limb's markers and joints, or None.
 
-        At most one limb is sought in a frame, which takes about 30 ms: the one that fits worst, if that is due.
+        At most one limb is searched in a frame, which takes about 30 ms.
         """
-        # in a frame that shows the fault: markers may be hidden in others
+        # only in a frame that shows the fault, as markers may be hidden in others
         strain, shown = self._of_limbs(self.strain), self._of_limbs(self.cost)
         worse = np.where((self.quiet > 0) | (shown < strain), -np.inf, strain - self.usual)
         limb = int(worse.argmax())
@@ -82,7 +81,7 @@ class LimbWatch:
             return None
         now = self.search.judge(x, points, OWN_PERSON.judged)
         found = self.search.refine(self._starts(x, limb), points, LIMB_ROUNDS, OWN_PERSON.judged)
-        # markers of misfit that a search has to gain; a foot turned about gained 2.5 to 4
+        # 0.6: least gain in misfit, in markers; a reversed foot gained 2.5 to 4
         if (now.misfit - found.misfit) * self.search.body.count > 0.6:
             self.strain[self.rows[limb]] = 0.0
             self.quiet[limb] = self.patience[limb] = PATIENCE
@@ -91,23 +90,24 @@ class LimbWatch:
         return None
 
     def _starts(self, x: np.ndarray, limb: int) -> np.ndarray:
-        """Unknowns (n, P) with other poses of a limb, and of its end alone."""
+        """Return unknowns (n, P) with other poses of a limb, half of them only at its end."""
         poses = np.roll(self.order, -POSES * self.tries, axis=0)[:POSES]
         self.tries += 1
         starts = np.repeat(x[None], len(poses), axis=0)
         for depth, joint in enumerate(self.search.limbs[limb]):
-            some = slice(0, None, 1 if depth > 1 else 2)
-            starts[some, 3 * joint:3 * joint + 3] = poses[some, joint]
+            chosen = slice(0, None, 1 if depth > 1 else 2)
+            starts[chosen, 3 * joint:3 * joint + 3] = poses[chosen, joint]
         return starts
 
     def _of_limbs(self, values: np.ndarray) -> np.ndarray:
+        """Sum values (L,) of markers over each limb."""
         return np.array([values[rows].sum() for rows in self.rows])
 
 
 def rows_of_limb(search: BodySearch, limb: list[int]) -> np.ndarray:
-    """The markers (n,) that the first joint of a limb moves."""
+    """Return the markers (n,) that the first joint of a limb moves."""
     body = search.body
     x = np.zeros((2, body.n_unknowns))
-    x[1, 3 * limb[0]:3 * limb[0] + 3] = 0.3                             # radians, so that centimetres tell
+    x[1, 3 * limb[0]:3 * limb[0] + 3] = 0.3                             # radians, which move markers by centimetres
     still, bent = body.positions(x)
     return np.flatnonzero(np.linalg.norm(bent - still, axis=1) > 0.01)

@@ -1,4 +1,4 @@
-"""Points of one frame matched with markers that are expected somewhere, and how well that is known."""
+"""Match the points of one frame with predicted markers and their uncertainty."""
 from __future__ import annotations
 
 from dataclasses import dataclass
@@ -7,17 +7,16 @@ import numpy as np
 
 from .body_search import assign_columns
 
-# Where the body that is expected carries the last offset of its point, a marker is 0.9 to 1.8 mm off at 120 Hz at the
-# median and 7 to 15 mm at the 99th percentile, on three recordings; at 30 Hz 3 to 8 and 29 to 84 mm.
-SEEN_SD = 0.004                      # metres that a point strays from its offset, besides what the filter does not know
-# cost of a marker without a point, and of each that is given up: 4.2 deviations of a marker that was just seen
-ALONE = 9.0
-TRIED = 8                            # shifts, the likeliest first
+# Misses of the prediction by body and last offset on three recordings: at 120 Hz 0.9 to 1.8 mm at the median and 7 to
+# 15 mm at the 99th percentile; at 30 Hz 3 to 8 and 29 to 84 mm.
+SEEN_SD = 0.004                      # metres: standard deviation of a point from its offset, beside the filter's own
+ALONE = 9.0                          # cost of a marker without a point: 4.2 deviations of a marker that was just seen
+TRIED = 8                            # shifts of groups that are tried, the likeliest first
 
 
 @dataclass(frozen=True, eq=False)
 class Expected:
-    """Where markers are expected.
+    """Predicted markers.
 
     Attributes
     ----------
@@ -30,20 +29,19 @@ class Expected:
     precision: np.ndarray
 
     def half_squares(self, points: np.ndarray) -> np.ndarray:
-        """Half the squared deviations (L, N) of points (N, 3) from where each marker is expected."""
+        """Compute half the squared deviations (L, N) of points (N, 3) from each predicted marker."""
         apart = points - self.places[:, None]
         return 0.5 * ((apart @ self.precision) * apart).sum(axis=-1)
 
     def vagueness(self, most: float) -> np.ndarray:
-        """What it costs (L,) that a marker may be anywhere in a volume, beside one that was just seen."""
+        """Compute the cost (L,) of the uncertainty of each marker, relative to one that was just seen."""
         return np.minimum(-0.5 * np.log(np.linalg.det(self.precision * SEEN_SD**2)), most)
 
 
 def intersect(first: Expected, second: Expected, rows: np.ndarray) -> Expected:
-    """Two predictions joined for some rows (n,) that `second` is of, as if their errors may be the same.
+    """Combine two predictions for some rows (n,), those of `second`, whose errors may be correlated.
 
-    Covariance intersection with equal weights: never more certain than both together would be if one repeated the
-    other.
+    This is covariance intersection with equal weights: it is never overconfident, even if both have the same error.
     """
     places, precision = first.places.copy(), first.precision.copy()
     A, B = first.precision[rows], second.precision
@@ -54,14 +52,16 @@ def intersect(first: Expected, second: Expected, rows: np.ndarray) -> Expected:
 
 
 def match(expected: Expected, points: np.ndarray, strict: bool) -> tuple[np.ndarray, np.ndarray]:
-    """The point (L,) of each marker, -1 without one, and how sure that is (L,), of 0 to 1.
+    """Match points with predicted markers; return the point (L,) of each, -1 without, and its confidence (L,), 0 to 1.
 
     Parameters
     ----------
     expected : Expected
+        Predicted markers.
     points : (N, 3) float, metres
+        Points of the frame.
     strict : bool
-        Markers of which hardly anything is known get no point.
+        Markers with a very uncertain prediction get no point.
 
     Examples
     --------
@@ -76,7 +76,7 @@ def match(expected: Expected, points: np.ndarray, strict: bool) -> tuple[np.ndar
 
 
 def certainty(cost: np.ndarray, chosen: np.ndarray) -> np.ndarray:
-    """How sure (L,) the point of each marker is, of 0 to 1, beside the next best of costs (L, N); 0 without a point."""
+    """Compute the confidence (L,), 0 to 1, of each match beside the next best of costs (L, N); 0 without a point."""
     rows, sure = np.flatnonzero(chosen >= 0), np.zeros(len(cost))
     if len(rows):
         here, others = cost[rows, chosen[rows]], cost.copy()
@@ -88,43 +88,45 @@ def certainty(cost: np.ndarray, chosen: np.ndarray) -> np.ndarray:
 
 def shift_groups(expected: Expected, slopes: np.ndarray, covariance: np.ndarray, spread: np.ndarray,
                  points: np.ndarray, chosen: np.ndarray) -> np.ndarray:
-    """Matches (L,) where markers side by side may all have been taken for their neighbours.
+    """Correct matches (L,) in which a group of neighbouring markers was shifted by one.
 
-    A foot that is faster than expected has its heel where the ankle was to be, and so on: each label is likely by
-    itself, one marker and one point are left over. Groups with such a marker are moved so that one of them gets the
-    point, and matched anew; they stay so where all deviations together, with their common cause, are less.
+    A foot that is faster than predicted has its heel where the ankle was predicted, and so on. Each label is plausible
+    by itself, but one marker and one point are left over. Such a group is moved so that one marker gets the free point,
+    and matched again. The new matches stay if all deviations together, with a common cause, are less.
 
     Parameters
     ----------
     expected : Expected
+        Predicted markers.
     slopes : (L, P, 3) float
         Derivatives of the places by the unknowns of the body.
     covariance : (P, P) float
         Of these unknowns.
     spread : (L,) float, m²
-        Variance of each marker besides.
+        Variance of each marker in addition.
     points : (N, 3) float, metres
+        Points of the frame.
     chosen : (L,) int
-        Matches of each by itself.
+        Matches without this correction.
     """
     free = find_unmatched(len(points), chosen)
-    # cost that this has to save
+    # 1.0: least gain in cost
     best, most = chosen, 1.0
     if (chosen >= 0).all() or not len(free):
         return chosen
     off = expected.half_squares(points[free])
     order = np.argsort(off, axis=None)[:TRIED]
-    # half squared deviations by which markers side by side may be off together
+    # 16: largest half squared deviation of a common shift
     for marker, j in zip(*np.unravel_index(order[off.ravel()[order] < 16.0], off.shape), strict=True):
         shift = points[free[j]] - expected.places[marker]
-        # metres within which markers are side by side: those of a foot, a hand, a head
+        # 0.25 m: neighbouring markers, of a foot, a hand or a head
         group = np.flatnonzero(((expected.places - expected.places[marker])**2).sum(axis=1) < 0.25**2)
         if (chosen[group] >= 0).all():
             continue
-        # points that no other marker has, after the shift
+        # points without a marker outside the group, relative to the shifted group
         pool = find_unmatched(len(points), np.delete(chosen, group))
         apart = expected.places[group][:, None] + shift - points[pool]
-        # metres, how well they lie on points after they were moved together
+        # 2 cm: standard deviation after the common shift
         moved, _ = assign_columns(np.minimum((apart**2).sum(axis=-1) / (2 * 0.02**2), 2 * ALONE), ALONE)
         moved = np.where(moved >= 0, pool[moved], -1)
         if (moved == chosen[group]).all():
@@ -138,7 +140,7 @@ def shift_groups(expected: Expected, slopes: np.ndarray, covariance: np.ndarray,
 
 
 def find_unmatched(count: int, chosen: np.ndarray) -> np.ndarray:
-    """Which (n,) of so many points no marker has in matches (L,)."""
+    """Return the points (n,), of `count`, that no marker has in matches (L,)."""
     free = np.ones(count, dtype=bool)
     free[chosen[chosen >= 0]] = False
     return np.flatnonzero(free)
@@ -146,11 +148,12 @@ def find_unmatched(count: int, chosen: np.ndarray) -> np.ndarray:
 
 def _joint_cost(places: np.ndarray, slopes: np.ndarray, covariance: np.ndarray, spread: np.ndarray, points: np.ndarray,
                 chosen: np.ndarray) -> float:
-    """What matches (n,) of some markers cost together: deviations that have one cause count once."""
+    """Compute the joint cost of matches (n,), in which correlated deviations by the pose count once."""
     rows = np.flatnonzero(chosen >= 0)
     alone = ALONE * (len(chosen) - len(rows))
     if not len(rows):
         return alone
+    # residuals r with covariance S = AᵀCA + spread: half r S⁻¹ r plus half log det S
     r = (points[chosen[rows]] - places[rows]).reshape(-1)
     A = slopes[rows].swapaxes(0, 1).reshape(len(covariance), -1)
     S = A.T @ covariance @ A + np.diag(np.repeat(spread[rows], 3))

@@ -1,4 +1,4 @@
-"""The page of a labelled recording: what is unsure first, then every marker over time."""
+"""Report page of a labelled recording: doubtful labels first, then every marker over time."""
 from __future__ import annotations
 
 from collections.abc import Sequence
@@ -15,15 +15,15 @@ from ...motion_pictures import chart_states, frame_panes, frames_apart
 from .label import SURE, LabelledMarkers
 from .recording import NAMELESS, LabelledRecording, pack_tracks
 
-SHOWN = 30                           # stretches that are listed
-# what the chart tells of a marker in a frame; where frames fall together the last of these is shown
+SHOWN = 30                           # most stretches in the list
+# states of a marker in the chart; where several frames share a pixel, the last one in this list is shown
 STATES = (("#a9c0d4", "labelled"), ("#54789a", "another track"), ("#f4f4f4", "no point"),
           ("#e39b3b", "doubtful"), ("#a8323e", "hardly believed"), ("#b7a3cc", "point without a label"))
 LABELLED, CHANGED, GAP, DOUBTFUL, UNLIKELY, LOOSE = range(len(STATES))
 
 
 def label_page(recording: LabelledRecording, metrics: Sequence[Metric], table: str, again: str) -> Page:
-    """The page; `table` is the name of the table of labels, `again` what to do when it is corrected."""
+    """Make the page; `table` is the name of the table of labels, `again` says how to run with corrections."""
     several = len(recording.people) > 1
     page = Page(f"{recording.path.name}, labelled", "Which point is which marker, and how sure that is.")
     page.section("Where it is unsure", f"To correct: open `{table}`, find the track, change its label (empty: no "
@@ -37,7 +37,9 @@ def label_page(recording: LabelledRecording, metrics: Sequence[Metric], table: s
     else:
         page.text(f"Nowhere: all labels have a confidence of at least {SURE:g}.")
     for k, one in enumerate(recording.people, start=1):
-        worst = frames_apart(_least_sure(one), 3, 0.3 * one.motion.rate)
+        # three frames with the least confident labels, 0.3 seconds apart
+        least = np.where(one.columns >= 0, one.confidence, 1.0).min(axis=1)
+        worst = frames_apart(np.argsort(least, kind="stable"), 3, 0.3 * one.motion.rate)
         page.bodies(frame_panes(one.motion, one.subject, one.markers.positions, worst),
                     (f"person {k}: " if several else "") + "the body with its labelled points, in the frames that are "
                     "least sure", 320)
@@ -49,7 +51,7 @@ def label_page(recording: LabelledRecording, metrics: Sequence[Metric], table: s
 
 @dataclass(frozen=True)
 class _Stretch:
-    """Frames `begin` up to `end` in which the label of a marker is unsure, most of all in `frame`."""
+    """Frames from `begin` to before `end` in which the label of a marker is doubtful, most in `frame`."""
 
     marker: int
     begin: int
@@ -59,10 +61,10 @@ class _Stretch:
 
 
 def unsure_stretches(recording: LabelledRecording) -> list[tuple[str, str, str, str, float, str, float, float]]:
-    """The rows of the table of stretches in which a label is unsure, the least sure first.
+    """Return the rows of the table of stretches with a doubtful label, the least confident first.
 
-    Frames, seconds, track, label, how far the point is from where the body has that marker, the other marker that the
-    body has nearest to the point, its distance, and the mean confidence. Distances are of the least sure frame.
+    Columns are frames, seconds, track, label, distance of the point from the simulated marker, the nearest other
+    marker, its distance, and the mean confidence. Distances are those of the least confident frame.
     """
     rows, first = list[tuple[str, str, str, str, float, str, float, float]](), 0
     for one in recording.people:
@@ -71,7 +73,7 @@ def unsure_stretches(recording: LabelledRecording) -> list[tuple[str, str, str, 
         for i, each in enumerate(found):
             columns = one.columns[each.begin:each.end, each.marker]
             tracks = list(dict.fromkeys(one.tracks[np.arange(each.begin, each.end), columns].tolist()))
-            # where the body has all its markers, of the stretches that are listed
+            # distances from all simulated markers, for the stretches in the list
             off, other = np.full(len(names), np.nan), each.marker
             if i < SHOWN:
                 places = one.layout.place(one.subject.template.with_vertices(bodies[i]))
@@ -88,7 +90,7 @@ def unsure_stretches(recording: LabelledRecording) -> list[tuple[str, str, str, 
 
 
 def _unsure(one: LabelledMarkers) -> list[_Stretch]:
-    """The stretches of a person, the least sure first."""
+    """Return the doubtful stretches of a person, the least confident first."""
     doubted, found = (one.columns >= 0) & (one.confidence < SURE), list[_Stretch]()
     for marker in np.flatnonzero(doubted.any(axis=0)).tolist():
         edges = np.flatnonzero(np.diff(np.r_[False, doubted[:, marker], False].astype(int))).reshape(-1, 2)
@@ -98,25 +100,20 @@ def _unsure(one: LabelledMarkers) -> list[_Stretch]:
     return sorted(found, key=lambda each: (each.confidence, each.begin - each.end))
 
 
-def _least_sure(one: LabelledMarkers) -> np.ndarray:
-    """Frames, those with the least sure labels first."""
-    return np.argsort(np.where(one.columns >= 0, one.confidence, 1.0).min(axis=1), kind="stable")
-
-
 def chart_labels(recording: LabelledRecording) -> Any:
-    """A matplotlib figure: every marker over time, and below it the points without a label."""
+    """Plot the state of every marker over time, and below it the points without a label."""
     columns, tracks = recording.columns, recording.people[0].tracks
     number = np.where(columns >= 0, np.take_along_axis(tracks, np.maximum(columns, 0), axis=1), -1)
-    # another track than that of the frame before it that had one
+    # another track than in the last frame in which the marker had one
     last = np.maximum.accumulate(np.where(columns >= 0, np.arange(len(columns))[:, None], -1), axis=0)
     before = np.concatenate([np.full_like(last[:1], -1), last[:-1]])
     changed = (before >= 0) & (np.take_along_axis(number, np.maximum(before, 0), axis=0) != number)
     sure = recording.confidence
-    # confidence below which another label is the likelier one
+    # 0.5: with less confidence another label is more likely
     state = np.select([columns < 0, sure < 0.5, sure < SURE, changed], [GAP, UNLIKELY, DOUBTFUL, CHANGED], LABELLED)
-    # points that are no marker, those first that are there longest
+    # points without a label, the longest first
     loose = pack_tracks(tracks, recording.people[0].unlabelled) >= 0
-    # rows of points without a label in the chart, at most
+    # at most 15 rows of these
     longest = np.argsort(-loose.sum(axis=0), kind="stable")[:15]
     state = np.concatenate([state, np.where(loose[:, longest], LOOSE, GAP)], axis=1)
     names = [*recording.names, *(f"{NAMELESS}{i + 1}" for i in longest)]

@@ -1,4 +1,4 @@
-"""A recording without labels: read, labelled, and written again with all that was in it."""
+"""Label a recording, and write it again with everything else that was in it."""
 from __future__ import annotations
 
 from collections.abc import Sequence
@@ -22,7 +22,7 @@ from .label import SURE, UNKNOWN, LabelledMarkers, label_people
 from .tracks import link_points
 
 LABELLED_SHARE, DOUBTFUL = "points with a label", "labels that are doubtful"
-NAMELESS = "*"                       # what labels of points that are no marker begin with
+NAMELESS = "*"                       # first letter of the labels of points that are no marker
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,15 +32,15 @@ class LabelledRecording:
     Attributes
     ----------
     path : Path
-        The recording.
+        Of the recording.
     points : MarkerSequence
-        As it was.
+        Its original points.
     people : list of LabelledMarkers
     names : strings
         Labels of all people, `Person1:LKNE` where there are several, or as the recording calls them, if it has labels
         of as many.
     known : (T, C) int
-        What was known of the labels: by the file, or by a table of corrections.
+        Known labels, from the file or a table of corrections.
     """
 
     path: Path
@@ -51,17 +51,17 @@ class LabelledRecording:
 
     @property
     def columns(self) -> np.ndarray:
-        """(T, L) the column of each marker of all people, -1 without one."""
+        """Column (T, L) of each marker of all people, -1 without one."""
         return np.concatenate([one.columns for one in self.people], axis=1)
 
     @property
     def confidence(self) -> np.ndarray:
-        """(T, L) of each label."""
+        """Confidence (T, L) of each label."""
         return np.concatenate([one.confidence for one in self.people], axis=1)
 
     @property
     def judgement(self) -> Judgement:
-        """What the labels of all people are worth."""
+        """Judgement of the labels of all people."""
         if len(self.people) == 1:
             return self.people[0].judgement
         return Judgement().merge(*(Judgement.of([f"person {k}: {why}" for why in one.judgement.problems],
@@ -69,9 +69,9 @@ class LabelledRecording:
                                    for k, one in enumerate(self.people, start=1)))
 
     def write(self, output: Path) -> None:
-        """Write the labelled recording: markers first, then points that are none, packed as `*1`, `*2`, ...
+        """Write the labelled recording: markers first, then other points, packed as `*1`, `*2`, ...
 
-        A C3D of a C3D keeps analog channels, events, parameters, and points that hold no positions.
+        From C3D to C3D, analog channels, events, parameters and points without positions stay.
         """
         loose = pack_tracks(self.people[0].tracks, self.people[0].unlabelled)
         source = np.concatenate([self.columns, loose], axis=1)
@@ -86,7 +86,7 @@ class LabelledRecording:
         write_markers(output, MarkerSequence(taken, labels, self.points.rate))
 
     def write_table(self, path: Path) -> None:
-        """Write the table of labels, to be corrected."""
+        """Write the table of labels, for corrections."""
         rows, sure = np.full(self.known.shape, -1), np.zeros(self.known.shape)
         frames, markers = np.nonzero(self.columns >= 0)
         columns = self.columns[frames, markers]
@@ -94,7 +94,7 @@ class LabelledRecording:
         write_labels(path, self.points.labels, self.people[0].tracks, rows, self.names, sure, self.known != UNKNOWN)
 
     def metrics(self) -> list[Metric]:
-        """The figures of the closing table."""
+        """Return the figures of the closing table."""
         there = self.columns >= 0
         points, sure = int(self.points.seen.sum()), self.confidence[there]
         missing = [self.names[i] for i in np.flatnonzero(~there.any(axis=0))]
@@ -113,9 +113,10 @@ def label_recording(path: Path, points: MarkerSequence, model: BodyModel | Subje
                     progress: Progress | None = None) -> LabelledRecording:
     """Label the points of a recording, as `read_marker_points` gives them.
 
-    Labels of the recording that are the layout's are known, unless `relabel`; so are those of the table `corrections`,
-    which go before. Arguments else as of `label_people`.
+    Labels of the recording that are in the layout count as known, unless `relabel`. Those of the table `corrections`
+    have priority. Other arguments are those of `label_people`.
     """
+    # names of the markers, with a prefix for each of several people
     who = people_of(points.labels)
     prefixes = [f"{prefix[0]}:" for prefix in who] if people > 1 and len(who) == people else \
         [f"Person{k}:" for k in range(1, people + 1)] if people > 1 else [""]
@@ -125,7 +126,7 @@ def label_recording(path: Path, points: MarkerSequence, model: BodyModel | Subje
         known = columns_of_labels(points, layout, prefixes)
     if corrections is not None:
         said = read_corrections(corrections, link_points(points.positions, points.rate), names)
-        for row in np.unique(said[said >= 0]):                         # the file's own label gives way in these frames
+        for row in np.unique(said[said >= 0]):                         # the file's label is dropped in these frames
             known[(known == row) & (said == row).any(axis=1, keepdims=True)] = UNKNOWN
         known = np.where(said == UNKNOWN, known, said)
     try:
@@ -136,34 +137,34 @@ def label_recording(path: Path, points: MarkerSequence, model: BodyModel | Subje
 
 
 def columns_of_labels(points: MarkerSequence, layout: MarkerLayout, prefixes: Sequence[str] = ("",)) -> np.ndarray:
-    """The rows (T, C) that the labels of a recording tell, `UNKNOWN` for others.
+    """Return known labels (T, C), as rows of the layout, from the labels of a recording; others are `UNKNOWN`.
 
-    Rows are those of the layout, counted on from person to person; `prefixes` are what their labels begin with, with
-    the colon. Of one person the only prefix of the recording, or none, will do.
+    Rows are numbered through all people; `prefixes` are those of their labels, with the colon. For one person the only
+    prefix of the recording, or none, will do.
     """
     spelled = layout.with_spellings([label.rpartition(":")[2] for label in points.labels])
     rows = {label: i for i, label in enumerate(layout.labels)}
     rows |= {alias: rows[label] for alias, label in spelled.aliases.items() if label in rows}
-    only = len(prefixes) == 1 and len(people_of(points.labels)) < 2     # whatever the file calls that person
+    only = len(prefixes) == 1 and len(people_of(points.labels)) < 2     # one person, under any prefix
     known, taken = np.full(points.positions.shape[:2], UNKNOWN), set[int]()
     for column, label in enumerate(points.labels):
         who, colon, bare = label.rpartition(":")
         if bare not in rows or not (only or who + colon in prefixes):
             continue
         row = rows[bare] + (0 if only else list(prefixes).index(who + colon) * len(layout.labels))
-        if row not in taken:                                            # of two spellings the first
+        if row not in taken:                                            # the first of two spellings
             taken.add(row)
             known[points.seen[:, column], column] = row
     return known
 
 
 def drop_unnamed(markers: MarkerSequence) -> MarkerSequence:
-    """The markers of a labelled recording, without the points that are none."""
+    """Return the markers of a labelled recording, without other points."""
     return markers.select([label for label in markers.labels if not label.startswith(NAMELESS)])
 
 
 def pack_tracks(tracks: np.ndarray, wanted: np.ndarray) -> np.ndarray:
-    """The columns (T, n) of points (T, C) that are wanted, in as few series as hold one track after the other.
+    """Pack wanted points (T, C) into few columns (T, n), one track after the other.
 
     Examples
     --------
@@ -175,6 +176,7 @@ def pack_tracks(tracks: np.ndarray, wanted: np.ndarray) -> np.ndarray:
     frames, columns = np.nonzero(wanted)
     number = tracks[frames, columns]
     order = np.lexsort((frames, number))
+    # pieces of tracks, in order of time, each into the first series that is free
     pieces = np.split(order, np.flatnonzero(np.diff(number[order])) + 1) if len(order) else []
     ends, series = list[int](), list[np.ndarray]()
     for piece in sorted(pieces, key=lambda each: int(frames[each[0]])):

@@ -1,22 +1,24 @@
-"""Frames in which several people stand apart, and whose points are whose there."""
+"""Find frames in which several people stand apart, and the points of each."""
 from __future__ import annotations
 
 import numpy as np
 from scipy.cluster.vq import kmeans2
 
-STARTS = 5                           # frames that are given, at most
-TRIED = 60                           # frames that are looked at
+STARTS = 5                           # most frames that are returned
+TRIED = 60                           # frames that are tested
 
 
 def separate_people(points: np.ndarray, people: int) -> tuple[np.ndarray, list[list[np.ndarray]]]:
-    """The frames (n,) in which people are farthest from each other on the ground, and the points of each person there.
+    """Find frames (n,) in which people stand farthest apart on the ground, and the points of each person there.
 
-    The ground is the plane, of those along two axes of the file, in which the points fall into the clearest groups.
+    The ground is the coordinate plane in which the points form the clearest groups.
 
     Parameters
     ----------
     points : (T, C, 3) float, metres
+        NaN where a column has no point.
     people : int
+        Number of people.
 
     Raises
     ------
@@ -24,7 +26,7 @@ def separate_people(points: np.ndarray, people: int) -> tuple[np.ndarray, list[l
         No frame in which they fall apart into groups of ten points.
     """
     best = list[tuple[float, int, list[np.ndarray]]]()
-    fewest = 10  # points of a person
+    fewest = 10  # least points of a person
     for t in np.unique(np.linspace(0, len(points) - 1, TRIED).astype(int)):
         seen = points[t, np.isfinite(points[t, :, 0])]
         for up in range(3):
@@ -33,7 +35,7 @@ def separate_people(points: np.ndarray, people: int) -> tuple[np.ndarray, list[l
             groups = [seen[group == k] for k in range(people)]
             if min(map(len, groups)) < fewest:
                 continue
-            # how far centres are apart, against how far the points of a group are from theirs
+            # distance of the centres over the mean distance of points from theirs
             between = min(np.linalg.norm(centres[i] - centres[j]) for i in range(people) for j in range(i))
             within = max(np.linalg.norm(flat - centres[group], axis=1).mean(), 1e-6)
             best.append((float(between / within), int(t), groups))

@@ -1,4 +1,4 @@
-"""Labels while the points come in: one frame of points without names, and the labels and the pose are there."""
+"""Real-time labelling: one frame of unlabelled points in, labels and pose out."""
 from __future__ import annotations
 
 from dataclasses import dataclass
@@ -17,29 +17,29 @@ from .limb_watch import LimbWatch
 from .live_matching import SEEN_SD, Expected, certainty, intersect, match, shift_groups
 from .tracks import ACCELERATION, BRIDGE
 
-FORGOTTEN = 0.25                     # seconds out of sight after which an offset is no longer known
-ROUNDS = 3                           # of matching and solving, where the first leaves doubts
-LABELS, GONE = 4, 0.5                # labels, and seconds with fewer after which the body is sought anew
-STRAINED, LOST = 0.2, 0.5            # mean strain above which another body is sought, and above which there is none
-PATIENCE, LONGEST = 0.5, 8.0         # seconds from a search that found nothing to the next, doubled up to the longest
-SETTLED = 10                         # steps of a body that was found
+FORGOTTEN = 0.25                     # seconds out of sight after which the offset of a marker is forgotten
+ROUNDS = 3                           # most rounds of matching and solving; one is enough without doubtful labels
+LABELS, GONE = 4, 0.5                # a body with fewer labels for that many seconds is gone
+STRAINED, LOST = 0.2, 0.5            # mean strain above which the body is searched again, and above which it is lost
+PATIENCE, LONGEST = 0.5, 8.0         # seconds from a search without success to the next, doubled up to LONGEST
+SETTLED = 10                         # most steps in which a body that was found is refined
 
 
 @dataclass(frozen=True, eq=False)
 class LabelledFrame:
-    """What one frame of points tells.
+    """The result for one frame of points.
 
     Attributes
     ----------
     columns : (L,) int
-        The point of each marker of the layout, -1 without one.
+        Point of each marker of the layout, -1 without one.
     confidence : (L,) float
         Of each label, 0 to 1; 0 without a point.
     pose : (J, 3) float, radians
         NaN where no body is followed.
     trans : (3,) float, metres
     found : bool
-        A body is followed; for half a second also where it has no points. Without one there are no labels.
+        A body is followed, also for half a second without points. If not, there are no labels.
     """
 
     columns: np.ndarray
@@ -50,19 +50,20 @@ class LabelledFrame:
 
 
 class LabelStream:
-    """Labels and motion of a person of known shape, frame by frame as points without names arrive.
+    """Label points and compute the motion of a person of known shape, frame by frame as unlabelled points arrive.
 
-    The motion so far says where each marker is expected and how well that is known; points are matched with markers
-    within that. A body that was not found yet, or has left, is sought in the points of one frame: that takes about half
-    a second, then there are pauses. A limb that fits worse than usual is sought anew in 30 ms.
+    The motion so far predicts each marker, with its uncertainty, and points are matched within that. A body that was
+    not found yet, or has left, is searched in the points of one frame. That takes about half a second, so there are
+    pauses between searches. A limb that fits worse than usual is searched again in 30 ms.
 
     Parameters
     ----------
     subject : Subject
-        The person, as of `label_markers(...).subject` or `mosh(...)`.
+        The person, such as `label_markers(...).subject`.
     layout : MarkerLayout
-        Where the markers sit on this person, as of `label_markers(...).layout`.
+        Where the markers sit on this person, such as `label_markers(...).layout`.
     rate : float, frames per second
+        Of the frames that `push` gets.
 
     Raises
     ------
@@ -71,9 +72,14 @@ class LabelStream:
 
     Examples
     --------
-    >>> stream = LabelStream(labelled.subject, labelled.layout, 120.0)
-    >>> frame = stream.push(points)                                     # (N, 3), metres, in any order
-    >>> places = np.where(frame.columns[:, None] >= 0, points[frame.columns], np.nan)
+    >>> from completion import load_layout
+    >>> from model import load_built_in_model
+    >>> model = load_built_in_model()
+    >>> layout = load_layout("cmu41", model.template, np.array(model.info["people_vertices"]))
+    >>> stream = LabelStream(model.subject(), layout, 120.0)
+    >>> frame = stream.push(layout.place(model.template)[::-1])         # (N, 3), metres, in any order
+    >>> frame.found, frame.columns[:3].tolist()
+    (True, [40, 39, 38])
 
     [SCAPE] §8
     """
@@ -90,16 +96,21 @@ class LabelStream:
         self.prediction = KalmanPrediction(self.body, self.config, self.rate)
         self.memory = _Memory(self.body.count, self.rate)
         self.x, self.found = np.full(self.body.n_unknowns, np.nan), False
-        self.belief = np.full(self.body.count, np.nan)                  # NaN of labels of which nothing is known yet
+        self.belief = np.full(self.body.count, np.nan)                  # confidence so far, NaN where unknown
         self.empty, self.quiet, self.patience = 0.0, 0.0, PATIENCE      # seconds
 
     def push(self, points: np.ndarray) -> LabelledFrame:
-        """The next frame.
+        """Process the next frame.
 
         Parameters
         ----------
         points : (N, 3) float, metres
-            In any order, as many as there are; NaN where one is out of sight.
+            In any order and any number; NaN where one is out of sight.
+
+        Returns
+        -------
+        LabelledFrame
+            Columns (L,) of the markers, confidence (L,), pose (J, 3) in radians, trans (3,) in metres.
 
         Raises
         ------
@@ -109,7 +120,7 @@ class LabelStream:
         points = np.asarray(points, dtype=np.float64)
         if points.ndim != 2 or points.shape[1] != 3:
             raise ValueError(f"points: expected shape (N, 3), metres, got {points.shape}; pass one frame at a time")
-        # points that are there
+        # visible points: finite, and within 1,000 km
         seen = np.flatnonzero((np.abs(points) < 1e6).all(axis=1))
         visible, dt = points[seen], 1 / self.rate
         self.quiet -= dt
@@ -117,14 +128,14 @@ class LabelStream:
         if not self.found and not self._begin(visible):
             return self._frame(np.full(self.body.count, -1), seen)
 
-        # labels and pose, and what they are worth
+        # labels and pose, and their confidence
         chosen, sure, places = self._follow(visible)
         self.memory.update(visible, chosen, places)
         self.watch.update(visible, chosen, places, dt)
         self._believe(visible, chosen, places, sure)
         frame = self._frame(chosen, seen)
 
-        # for the next frame: another limb, another body, or none
+        # prepare the next frame: search a limb or the body again, or give the body up
         self.empty = self.empty + dt if (chosen >= 0).sum() < LABELS else 0.0
         if self.empty > GONE:
             self.found = False
@@ -134,18 +145,18 @@ class LabelStream:
 
     @property
     def _enough(self) -> float:
-        """Points in which a body is sought."""
+        """Least number of points for a search."""
         return max(FEWEST, 0.5 * self.body.count)
 
     def _follow(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """The point (L,) of each marker, how sure that is (L,), and where the body has the markers now (L, 3)."""
+        """Match and solve a frame; return points (L,) of the markers, confidence (L,) and simulated markers (L, 3)."""
         body, prediction = self.body, self.prediction
         expected, information = prediction.expect()
         x, C, spread = expected, prediction.covariance, self.memory.spread()
-        clear = 0.99  # confidence of every label from which one round is enough
-        small = 0.01  # metres that a round may move markers for that
+        clear = 0.99  # with this confidence of every label one round is enough,
+        small = 0.01  # if it moves no marker by more than 1 cm
         for i in range(ROUNDS):
-            # where the markers are expected: on the body at x, uncertain by C, each with its offset, and on its track
+            # predict markers: from the body at x with covariance C and their offsets, and from their tracks
             pose, trans, _ = body.body.split(x[None])
             y, columns = body.shapes.columns(pose, trans)
             places, slopes = y[0].T, columns[0].transpose(2, 0, 1).copy()                        # (L, 3), (L, P, 3)
@@ -157,14 +168,14 @@ class LabelStream:
             chosen, sure = shifted, np.where(shifted != chosen, 0.5, sure)
             if not (chosen >= 0).any():
                 break
-            # one Gauss-Newton step; markers in doubt follow the others at first
+            # one Gauss-Newton step; doubtful markers have less weight at first
             targets = _take(points, chosen)
             weights, _ = marker_weights(on_body.places, targets, self.config.marker_sd, self.config.outlier)
             if i == 0 and not doubt:
                 weights = weights * np.maximum(2 * sure - 1, 0.0)
             equations = body.with_prior(point_system(y, columns, targets[None], weights[None]), pose)
             H = equations.hessian[0] + information
-            pull = information @ body.step_to(expected, x) if i else 0.0                         # none at the start
+            pull = information @ body.step_to(expected, x) if i else 0.0                         # 0 at the prediction
             step = -np.linalg.solve(H, equations.gradient[0] + pull)
             x, moved = body.retract(x, step), step @ slopes
             places = places + moved
@@ -178,22 +189,22 @@ class LabelStream:
         return chosen, sure, places
 
     def _believe(self, points: np.ndarray, chosen: np.ndarray, places: np.ndarray, sure: np.ndarray) -> None:
-        """Confidence: what the match was sure of, and over time what the body alone says."""
+        """Update the confidence: that of the match, limited by what the body alone has said over time."""
         there = chosen >= 0
-        # metres, scale at which the body alone tells a label
+        # 2 cm: standard deviation of a marker when the body alone tells the labels
         apart = ((points - places[:, None])**2).sum(axis=-1) / (2 * 0.02**2)
         alone = certainty(apart, chosen) * np.where(self.watch.doubtful(), 0.5, 1.0)
-        # seconds in which a label that was in doubt is believed again
+        # 0.5 s: time constant in which a doubtful label regains confidence
         earned = self.belief + (alone - self.belief) * min(1.0, 1 / (0.5 * self.rate))
         earned = np.where(np.isnan(earned), alone, earned)
         self.belief = np.where(there, np.minimum(earned, sure), self.belief)
 
     def _begin(self, points: np.ndarray) -> bool:
-        """Seek the body in the points (N, 3) of a frame; whether it was found."""
+        """Search the body in the points (N, 3) of a frame; return whether it was found."""
         if len(points) < self._enough or self.quiet > 0:
             return False
         found = self._find(points)
-        # markers for which there are no points cost the right body as much as any other
+        # hidden markers cost the right body as much as any other
         hidden = ALONE * max(0, self.body.count - len(points)) / self.body.count
         if self.search.judge(found.x, points, JUDGED).misfit - hidden > FOUND:
             self._wait()
@@ -202,11 +213,11 @@ class LabelStream:
         return True
 
     def _replace_body(self, points: np.ndarray) -> bool:
-        """Seek the body anew where it has fitted badly for a while; whether it is elsewhere, or nowhere."""
+        """Search the body again where it has fitted badly for a while; return whether it moved or was lost."""
         if self.watch.mean_strain < STRAINED or self.quiet > 0:
             return False
         now, found = self.search.judge(self.x, points, OWN_PERSON.judged), self._find(points)
-        # markers of misfit that another body has to gain
+        # 1.0: gain in misfit, in markers, for which the new body is taken
         if (now.misfit - found.misfit) * self.body.count > 1.0:
             self._go_on_from(found)
             return True
@@ -215,7 +226,7 @@ class LabelStream:
         return not self.found
 
     def _replace_limb(self, points: np.ndarray) -> None:
-        """Go on with another pose of a limb where that fits better."""
+        """Continue with another pose of a limb where that fits better."""
         found = self.watch.seek(self.x, points)
         if found is None:
             return
@@ -228,10 +239,10 @@ class LabelStream:
         self.belief[rows] = np.nan
 
     def _find(self, points: np.ndarray) -> Placement:
-        """The best body in a frame of points (N, 3), from nothing else."""
+        """Search the best body in a frame of points (N, 3) alone."""
         found = self.search.judge(self.search.find(points).x, points, OWN_PERSON.judged)
         found = self.search.restart_limbs(found, points, OWN_PERSON.judged)
-        # as near to its points as it will be followed
+        # refine it as closely as `_follow` will
         targets = _take(points, found.matches)
         weights, _ = marker_weights(self.body.positions(found.x), targets, self.config.marker_sd, self.config.outlier)
         x = self.body.solve(found.x[None], targets, weights, SETTLED, 1e-4).x[0]
@@ -247,11 +258,11 @@ class LabelStream:
         self.quiet = self.patience = PATIENCE
 
     def _wait(self) -> None:
-        """Seek nothing for a while, twice as long every time."""
+        """Wait until the next search, twice as long every time."""
         self.quiet, self.patience = self.patience, min(2 * self.patience, LONGEST)
 
     def _frame(self, chosen: np.ndarray, seen: np.ndarray) -> LabelledFrame:
-        """The result, in columns of the points as they were given."""
+        """Return the result, in columns of the original points."""
         there = chosen >= 0
         columns = np.full(self.body.count, -1)
         columns[there] = seen[chosen[there]]
@@ -260,42 +271,43 @@ class LabelStream:
 
 
 class _Memory:
-    """What is remembered of the points of each marker."""
+    """Memory of each marker: last point, velocity, offset from the body."""
 
     def __init__(self, count: int, rate: float) -> None:
-        self.bridge = max(BRIDGE, 1.5 / rate)                           # seconds that constant velocity is believed
-        self.unseen = np.full(count, np.inf)                            # seconds
+        self.bridge = max(BRIDGE, 1.5 / rate)                           # seconds of extrapolation by constant velocity
+        self.unseen = np.full(count, np.inf)                            # seconds since the last point
         self.last, self.velocity, self.off = (np.zeros((count, 3)) for _ in range(3))
         self.moving = np.zeros(count, dtype=bool)                       # the velocity is known
 
     def forget(self, rows: np.ndarray) -> None:
+        """Forget some markers (n,)."""
         self.unseen[rows], self.moving[rows] = np.inf, False
 
     def offsets(self) -> np.ndarray:
-        """(L, 3) metres from the place of each marker to its point, ever less while it is out of sight."""
+        """Return offsets (L, 3), metres, of points from simulated markers, fading while a marker is out of sight."""
         return np.exp(-self.unseen / FORGOTTEN)[:, None] * self.off
 
     def spread(self) -> np.ndarray:
-        """(L,) m², variance of each point about its place and offset."""
-        worn_sd = 0.025  # metres from its place on the body that a point lies, whose offset is not known
+        """Compute the variance (L,), m², of each point about its simulated marker plus offset."""
+        worn_sd = 0.025  # metres: standard deviation of a point whose offset is unknown
         return np.minimum(SEEN_SD**2 + worn_sd**2 * self.unseen / FORGOTTEN, worn_sd**2)
 
     def with_tracks(self, expected: Expected) -> Expected:
-        """Where markers are expected, by constant velocity besides where they were seen of late."""
+        """Combine predictions by the body with extrapolation at constant velocity, for recently seen markers."""
         rows = np.flatnonzero(self.moving & (self.unseen < self.bridge))
         if not len(rows):
             return expected
         dt = self.unseen[rows]
-        # metres that constant velocity misses; 0.6 mm at the median at 120 Hz
+        # 4 mm plus the effect of acceleration; constant velocity misses by 0.6 mm at the median at 120 Hz
         sd = 0.004 + 0.5 * ACCELERATION * dt**2
         ahead = self.last[rows] + self.velocity[rows] * dt[:, None]
         return intersect(expected, Expected(ahead, np.eye(3) / sd[:, None, None]**2), rows)
 
     def update(self, points: np.ndarray, chosen: np.ndarray, places: np.ndarray) -> None:
-        """The next frame: points (N, 3), the one of each marker (L,), and where the body has its markers (L, 3)."""
+        """Remember a frame: points (N, 3), the one of each marker (L,), and simulated markers (L, 3)."""
         rows = np.flatnonzero(chosen >= 0)
         at, dt = points[chosen[rows]], self.unseen[rows]
-        # seconds over which offsets are averaged
+        # 0.015 s: time constant over which offsets are averaged
         share = np.where(dt < FORGOTTEN, 1 - np.exp(-dt / 0.015), 1.0)[:, None]
         self.off[rows] += share * (at - places[rows] - self.off[rows])
         self.moving[rows] = dt < self.bridge
@@ -304,7 +316,7 @@ class _Memory:
 
 
 def _take(points: np.ndarray, chosen: np.ndarray) -> np.ndarray:
-    """The points (L, 3) that were chosen, NaN where none was."""
+    """Return the chosen points (L, 3), NaN where there is none."""
     targets = np.full((len(chosen), 3), np.nan)
     targets[chosen >= 0] = points[chosen[chosen >= 0]]
     return targets

@@ -1,32 +1,33 @@
-"""Tracks: points of successive frames that are the same marker, as far as their motion tells."""
+"""Tracks: join points of successive frames that are the same marker, as far as their motion tells."""
 from __future__ import annotations
 
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
-# At 120 Hz the markers of four recordings miss constant velocity by 0.6 mm at the median, 9 mm at the 99th percentile
-# and 18 mm at the 99.9th; other markers are 25 mm away at least, 55 mm at the first percentile.
-ACCELERATION = 100.0                 # m/s²; what it may miss besides, over the time since the last observation
-SPEED = 5.0                          # m/s of a marker that was seen once, whose velocity is not known
-BRIDGE = 0.1                         # seconds out of sight after which a track has ended
+# Four recordings at 120 Hz: constant velocity misses by 0.6 mm at the median, 9 mm at the 99th percentile, 18 mm at the
+# 99.9th. The nearest other marker is at least 25 mm away, 55 mm at the first percentile.
+ACCELERATION = 100.0                 # m/s²: largest acceleration since the last observation
+SPEED = 5.0                          # m/s: largest speed of a marker that was seen once
+BRIDGE = 0.1                         # seconds out of sight after which a track ends
 
 
 def link_points(points: np.ndarray, rate: float) -> np.ndarray:
-    """Join points of successive frames to tracks: each is where constant velocity has it, and nothing else is near.
+    """Join points of successive frames to tracks: where constant velocity predicts them, if nothing else is near.
 
-    A track ends rather than take a point that another track may claim: pieces are joined later, by the body. Where
-    columns are tracks already, as a camera system writes them, a point that goes on in its own column is preferred.
+    A track ends rather than take a point that another track may claim; the body joins the pieces later. Where columns
+    are tracks already, as camera systems write them, a point in the same column is preferred.
 
     Parameters
     ----------
     points : (T, C, 3) float, metres
         NaN where a column has no point. The order of columns need not mean anything.
     rate : float, frames per second
+        Of the points.
 
     Returns
     -------
     (T, C) int
-        The track of each point, counted from 0; -1 where there is no point.
+        Track of each point, counted from 0; -1 where there is no point.
 
     Examples
     --------
@@ -38,11 +39,11 @@ def link_points(points: np.ndarray, rate: float) -> np.ndarray:
     T, C = points.shape[:2]
     tracks, count = np.full((T, C), -1), 0
     steady = has_tracks(points, rate)
-    # of every live track: last position, velocity, frame and column of it, number, and observations so far
+    # for every live track: last position, velocity, frame, column, number, and count of observations
     last, velocity = np.zeros((0, 3)), np.zeros((0, 3))
     when, column, number, age = (np.zeros(0, dtype=int) for _ in range(4))
-    noise = 0.010  # metres that a prediction may miss at any rate
-    margin = 0.004  # and metres besides
+    noise = 0.010  # metres: miss that is always allowed
+    margin = 0.004  # metres by which any other candidate has to be farther away
     for t in range(T):
         live = (t - when) / rate <= max(BRIDGE, 1.5 / rate)
         last, velocity, when, column, number, age = (
@@ -51,10 +52,11 @@ def link_points(points: np.ndarray, rate: float) -> np.ndarray:
         p, passed = points[t, seen], (t - when) / rate
         source = np.full(len(seen), -1)                                 # the live track that each point continues
 
+        # assign points to predictions within a gate, and keep only matches without a rival
         if len(number) and len(seen):
             apart = np.linalg.norm((last + velocity * passed[:, None])[:, None] - p, axis=2)
             gate = np.where(age > 1, noise + 0.5 * ACCELERATION * passed**2, noise + SPEED * passed)
-            # metres that a prediction may miss at most
+            # 8 cm: largest miss
             gate = np.minimum(gate, 0.08)
             same = steady & (column[:, None] == seen)
             # the same column is believed at twice the distance, whoever else is near
@@ -65,11 +67,11 @@ def link_points(points: np.ndarray, rate: float) -> np.ndarray:
             others = apart.copy()
             others[rows, columns] = np.inf
             rival = np.minimum(others[rows].min(axis=1), others[:, columns].min(axis=0))
-            # times the distance that any other candidate has to be away
+            # 1.5: factor by which any other candidate has to be farther away
             sure = (rival > 1.5 * apart[rows, columns] + margin) | same[rows, columns]
             source[columns[sure]] = rows[sure]
 
-        # points that continue a track update it, others begin one
+        # update the tracks of matched points, and begin a track for each other point
         old = source >= 0
         tracks[t, seen[old]] = number[source[old]]
         tracks[t, seen[~old]] = count + np.arange((~old).sum())
@@ -87,18 +89,19 @@ def link_points(points: np.ndarray, rate: float) -> np.ndarray:
 
 
 def has_tracks(points: np.ndarray, rate: float) -> bool:
-    """Whether columns of points (T, C, 3) follow one marker each for a while, and are not shuffled in every frame."""
+    """Tell whether columns of points (T, C, 3) are tracks, not shuffled in every frame, by their median speed."""
     steps = np.linalg.norm(np.diff(points, axis=0), axis=2)
     known = steps[np.isfinite(steps)]
     return bool(len(known)) and bool(np.median(known) < SPEED / rate)
 
 
 def mean_along_tracks(values: np.ndarray, tracks: np.ndarray, half: int) -> np.ndarray:
-    """Means (T, C, L) of values (T, C, L) over the observations of a track (T, C), `half` of them to either side."""
+    """Average values (T, C, L) along tracks (T, C), over `half` observations to either side."""
     T, C, L = values.shape
     order = np.argsort(tracks.ravel(), kind="stable")
     order = order[tracks.ravel()[order] >= 0]
     number = tracks.ravel()[order]
+    # differences of running sums, within the range of each track
     begins = np.flatnonzero(np.r_[True, np.diff(number) > 0])[:len(number)]
     ends = np.r_[begins[1:], len(number)]
     first, last = (np.repeat(of, ends - begins) for of in (begins, ends))

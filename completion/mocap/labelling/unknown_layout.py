@@ -1,4 +1,4 @@
-"""A layout that is not known: where on the body each track of a recording sits."""
+"""Find an unknown layout: where on the body each track of a recording sits."""
 from __future__ import annotations
 
 from collections.abc import Callable
@@ -24,36 +24,36 @@ from ..subject.person import PersonFit, find_person, spread_frames
 from .body_search import OTHERS, UPS, BodySearch, Placement, match_points
 from .tracks import has_tracks, link_points
 
-STARTS = 5                           # frames in which it is sought
-TRIED = 4                            # of what was found there, that are followed through other frames
-# of the person and the places together: more frames than usual and poses hardly held, since the motions of a recording
-# are not the prior's: of 88 simulated markers 60% were within 15 mm, 48% with twelve frames and usual weights
+STARTS = 5                           # frames in which the body is searched
+TRIED = 4                            # best bodies of these frames, which are fitted to other frames
+# Fit of person and places together: more frames and a weaker pose prior than usual, as motions of a recording differ
+# from the prior's. 60% of 88 simulated markers were within 15 mm, 48% with twelve frames and usual weights.
 CLOSER = PersonConfig(frames=24, pose=0.02)
-ROUNDS = 5                           # each holds the places to those of the one before; 2 left 4 mm more
-NAMED = 4                            # rounds in which markers that a usual set has are held to its places
-LIKE = 0.10                          # metres from the place of a usual set within which a marker may be its
-LONG = 0.3                           # share of the frames that a track has to have
-OUTLIER = 0.06                       # metres beyond which it does not matter how far a track is from a place
+ROUNDS = 5                           # fits, each starting from the places of the one before; 2 left 4 mm more
+NAMED = 4                            # fits in which markers of a known marker set are held to its places
+LIKE = 0.10                          # metres: largest distance of a marker from the place of a known set
+LONG = 0.3                           # least share of the frames in which a track has to be seen
+OUTLIER = 0.06                       # metres beyond which the distance of a track from a place does not matter
 
 
 @dataclass(frozen=True, eq=False)
 class FoundLayout:
-    """Where the markers of a recording sit.
+    """The layout of a recording, and how certain it is.
 
     Attributes
     ----------
     layout : MarkerLayout
-        A marker for each track, or for several that are one, with a name by anatomy: that of a usual set where one
-        explains the markers, else of the part and a number.
+        A marker for each track, or for several tracks of one marker. Names are those of a known marker set if one
+        explains the markers, else part and number.
     tracks : dict
-        Label -> the labels of the tracks that it was found from.
+        Label -> the labels of its tracks.
     uncertainty : (L,) float, metres
         Expected distance of each place, along the skin, from the true one.
     left_out : dict
-        Label of a track -> why it is no marker.
+        Label of a track -> reason why it is no marker.
     person : PersonFit
     margin : float
-        What the next best body leaves, over what this one does.
+        Ratio of the residuals of the next best body to those of this one.
     """
 
     layout: MarkerLayout
@@ -65,17 +65,17 @@ class FoundLayout:
 
     @property
     def judgement(self) -> Judgement:
-        """What the layout is worth."""
+        """Judgement of the layout."""
         bad, check = [], []
         if self.person.residual > 0.02:
             bad.append(f"the tracks lie {1000 * self.person.residual:.0f} mm from the body: no person, or several?")
-        # ratio of what the next best body leaves, below which they cannot be told apart
+        # 1.15: with a smaller ratio the two bodies cannot be told apart
         if self.margin < 1.15:
             check.append("another pose explains the tracks nearly as well: left and right, or front and back, may be "
                          "exchanged")
         turns = rotations.exp(self.person.poses[:, 1:])
         range_of_joint = np.linalg.norm(rotations.log(np.swapaxes(turns[:1], -1, -2) @ turns), axis=-1).max(axis=0)
-        # radians that a joint turns at most in the frames of the fit, if it is still
+        # 0.25 radians: a joint that turns less over the frames of the fit is still
         if (range_of_joint < 0.25).mean() > 0.5:
             check.append("the person hardly moves: where markers sit on their limb is not told")
         if (self.uncertainty > 0.03).mean() > 0.2:
@@ -87,25 +87,41 @@ class FoundLayout:
 
 @one_thread()
 def find_layout(model: BodyModel, points: MarkerSequence, progress: Progress | None = None) -> FoundLayout:
-    """Where on the skin each track of a recording sits, of a person and a layout that are both unknown.
+    """Find where on the skin each track of a recording sits, with unknown person and layout.
 
-    In a few frames the body is sought whose skin passes below all points; a point sits where it is nearest. Of these
-    bodies the one is taken on whose skin the tracks keep their places in other frames, too. Then places, person and
-    poses tell each other in turn.
+    In a few frames a body is searched whose skin passes below all points; each point sits where the skin is nearest.
+    The best of these bodies is the one on which tracks keep their places in other frames. Then places, person and poses
+    are refined together.
 
     Parameters
     ----------
     model : BodyModel
         With betas.
     points : MarkerSequence
-        Tracks of one person; broken ones are joined as far as their motion tells.
+        Tracks (T, C, 3) of one person, metres; broken ones are joined as far as their motion tells.
     progress : callable, optional
         Called with (done, total).
+
+    Returns
+    -------
+    FoundLayout
+        The layout, its uncertainty (L,) in metres, and the person.
 
     Raises
     ------
     ValueError
         A model without betas, fewer than ten tracks, no body that fits them.
+
+    Examples
+    --------
+    It takes one to two minutes for a recording, so here is only the check of its input.
+
+    >>> from model import load_built_in_model
+    >>> find_layout(load_built_in_model(), MarkerSequence(np.ones((9, 2, 3)), ("a", "b"), 100.0))
+    Traceback (most recent call last):
+    ValueError: points: expected at least 10 tracks that are seen in 30% of the frames, found 2
+
+    [MoSh]
     """
     if not model.n_betas:
         raise ValueError("model: expected one with betas, this one knows its template's body only")
@@ -113,9 +129,9 @@ def find_layout(model: BodyModel, points: MarkerSequence, progress: Progress | N
     tracks = long_tracks(points)
     total = STARTS + TRIED + ROUNDS
 
-    # bodies whose skin passes below all points of a frame
+    # candidate bodies: the skin passes below all points of a frame
     starts = _search_skin(model, tracks, lambda done: tell(done, total))
-    # the one on whose skin the tracks keep their places
+    # the candidate on which the tracks keep their places in other frames
     tried = list[tuple[float, PersonFit]]()
     for i, (t, placement) in enumerate(starts):
         fit = find_person(model, tracks, _layout_below(model, tracks, t, placement))
@@ -126,19 +142,19 @@ def find_layout(model: BodyModel, points: MarkerSequence, progress: Progress | N
 
     margin = min([cost for cost, other in tried[1:] if _differs(model, fit, other)], default=np.inf) / best
 
-    # places by the body in all its frames, then both together, from where they were before
+    # places by the body in all its frames, then places and person together, in rounds
     fit = find_person(model, tracks, _best_places(model, fit, tracks))
     for i in range(ROUNDS):
         fit = find_person(model, tracks, replace(fit.layout, loose=()), CLOSER)
         tell(STARTS + TRIED + i + 1, total)
-    # markers of a usual set are where it has them, as far as the tracks allow
+    # if a known marker set explains the markers, move them to its places, as far as the tracks allow
     named, free = dict[str, str](), fit
     for _ in range(NAMED):
         usual, labels = name_markers(model, fit.layout)
         if usual is None:
             break
         snapped = find_person(model, tracks, _snap(fit.layout, labels, usual), CLOSER)
-        # ratio of what is left above which a usual set is not the one that is worn
+        # 1.15: largest ratio of residuals with and without the known set
         if _cost(snapped) > 1.15 * _cost(free):
             break
         fit, named = snapped, labels
@@ -146,19 +162,19 @@ def find_layout(model: BodyModel, points: MarkerSequence, progress: Progress | N
 
 
 def name_markers(model: BodyModel, layout: MarkerLayout) -> tuple[MarkerLayout | None, dict[str, str]]:
-    """The usual set that explains most markers of a layout, none if it is below `SHARE`, and label -> label in it."""
+    """Find the known marker set that explains most markers of a layout, or None, and label -> label in that set."""
     places = layout.skin_points(model.template.vertices)
-    share = 0.75  # of the markers that a usual set has to explain
+    share = 0.75  # least share of the markers that a set has to explain
     best: tuple[float, MarkerLayout | None, dict[str, str]] = (share * len(layout.labels), None, {})
     for name in layout_names():
         try:
             usual, _ = choose_layout(model, name, ())
-        except ValueError:                                              # not known on this model's triangles
+        except ValueError:                                              # no sets are known on this model's triangles
             return None, {}
         apart = np.linalg.norm(places[:, None] - usual.skin_points(model.template.vertices), axis=2)
         rows, columns = linear_sum_assignment(np.minimum(apart, LIKE)**2)
         near = apart[rows, columns] < LIKE
-        # a nearer set counts more, a larger one only as far as it is worn
+        # score: near markers count more, and unused markers of the set cost 0.3 each
         score = float((1 - (apart[rows, columns][near] / LIKE)**2 / 2).sum()) - 0.3 * (len(usual.labels) - near.sum())
         if near.sum() >= share * len(layout.labels) and score > best[0] * (best[1] is not None):
             best = score, usual, {layout.labels[r]: usual.labels[c]
@@ -167,7 +183,7 @@ def name_markers(model: BodyModel, layout: MarkerLayout) -> tuple[MarkerLayout |
 
 
 def _snap(layout: MarkerLayout, labels: dict[str, str], usual: MarkerLayout) -> MarkerLayout:
-    """A layout with the markers that have a label of a usual set where that has them."""
+    """Return a layout with named markers moved to the places of a known set."""
     rest = [label for label in layout.labels if label not in labels]
     order = [usual.labels.index(labels[label]) for label in layout.labels if label in labels]
     vertices, weights = usual.skin
@@ -177,8 +193,8 @@ def _snap(layout: MarkerLayout, labels: dict[str, str], usual: MarkerLayout) -> 
 
 
 def long_tracks(points: MarkerSequence) -> MarkerSequence:
-    """The tracks of a recording that are seen long enough: its columns, or pieces that its points were joined to."""
-    fewest = 10  # tracks
+    """Return the long tracks of a recording: its columns, or pieces that its points were joined to."""
+    fewest = 10  # least number of tracks
     if not has_tracks(points.positions, points.rate):
         number = link_points(points.positions, points.rate)
         frames, columns = np.nonzero(number >= 0)
@@ -191,8 +207,8 @@ def long_tracks(points: MarkerSequence) -> MarkerSequence:
         series = np.full((len(number), len(kept), 3), np.nan)
         place = np.full(number.max() + 1, -1)
         place[kept] = np.arange(len(kept))
-        mine = place[which] >= 0
-        series[frames[mine], place[which[mine]]] = points.positions[frames[mine], columns[mine]]
+        of_kept = place[which] >= 0
+        series[frames[of_kept], place[which[of_kept]]] = points.positions[frames[of_kept], columns[of_kept]]
         return MarkerSequence(series, tuple(f"track{k}" for k in kept), points.rate)
     long = points.seen.mean(axis=0) >= LONG
     if long.sum() < fewest:
@@ -203,8 +219,8 @@ def long_tracks(points: MarkerSequence) -> MarkerSequence:
 
 def _search_skin(model: BodyModel, tracks: MarkerSequence, tell: Callable[[int], None]
                  ) -> list[tuple[int, Placement]]:
-    """Frames, and bodies whose skin passes below the points there, the best first."""
-    # points of the skin among which a body is sought: 9 cm apart
+    """Search bodies whose skin passes below the points of some frames; return frames and bodies, the best first."""
+    # 250 points of the skin, 9 cm apart, serve as markers for the search
     vertices = farthest_points(model.template.vertices, 250)
     skin = MarkerLayout(tuple(f"skin{v}" for v in vertices), vertices)
     subject = model.subject()
@@ -216,13 +232,13 @@ def _search_skin(model: BodyModel, tracks: MarkerSequence, tell: Callable[[int],
         visible = tracks.positions[t, tracks.seen[t]]
         for axis in (*UPS, *OTHERS[:2]):
             placement = search.find(visible, (axis,))
-            # what counts is how far the points are from the skin, not which skin has points
+            # only the distance of points from the skin counts, not skin without points
             matches, _ = match_points(search.body.positions(placement.x), visible, OUTLIER)
             at = search.body.positions(placement.x)[matches >= 0]
             off = np.linalg.norm(at - visible[matches[matches >= 0]], axis=1)
             cost = float(np.minimum(off, OUTLIER).sum() + OUTLIER * (len(visible) - len(off))) / len(visible)
             found.append((cost, int(t), placement))
-            # metres from the skin, mean of the points, at which no other axis is tried
+            # 25 mm mean distance: good enough, no other axis is tried
             if cost < 0.025:
                 break
         tell(i + 1)
@@ -231,7 +247,7 @@ def _search_skin(model: BodyModel, tracks: MarkerSequence, tell: Callable[[int],
 
 
 def _layout_below(model: BodyModel, tracks: MarkerSequence, t: int, placement: Placement) -> MarkerLayout:
-    """The layout of the tracks that are seen in a frame, each where the skin of a body is nearest there."""
+    """Return a layout of the visible tracks of a frame, each at the nearest vertex of a body."""
     subject = model.subject()
     n = 3 * len(subject.skeleton.parents)
     posed = subject.vertices(placement.x[None, :n].reshape(1, -1, 3), placement.x[None, n:n + 3])[0]
@@ -243,7 +259,7 @@ def _layout_below(model: BodyModel, tracks: MarkerSequence, t: int, placement: P
 
 
 def _best_places(model: BodyModel, fit: PersonFit, tracks: MarkerSequence) -> MarkerLayout:
-    """The layout of all tracks, each where it keeps its place best on the skin of a person in the frames of its fit."""
+    """Return a layout of all tracks, each at the vertex where it keeps its place best in the frames of a fit."""
     subject, frames = model.subject(fit.betas), fit.frames[:, 1]
     vertices = subject.vertices(fit.poses, fit.trans)
     normals = np.stack([model.template.with_vertices(v).vertex_normals for v in vertices])
@@ -255,7 +271,7 @@ def _best_places(model: BodyModel, fit: PersonFit, tracks: MarkerSequence) -> Ma
             places.append(-1)
             distances.append(DISTANCE)
             continue
-        # metres that a marker may be off the skin
+        # 4 cm: largest distance of a marker from the skin
         off, lift = stand_off(targets[seen], vertices[seen], normals[seen], 0.0, 0.04)
         best = int(np.minimum(off**2, OUTLIER**2).mean(axis=0).argmin())
         places.append(best)
@@ -266,12 +282,12 @@ def _best_places(model: BodyModel, fit: PersonFit, tracks: MarkerSequence) -> Ma
 
 
 def _cost(fit: PersonFit) -> float:
-    """What a fit leaves: the mean distance of markers, metres, at most `OUTLIER` each."""
+    """Compute the mean distance of markers of a fit, metres, at most `OUTLIER` each."""
     return float(np.nanmean(np.minimum(fit.residuals, OUTLIER)))
 
 
 def _differs(model: BodyModel, one: PersonFit, other: PersonFit) -> bool:
-    """Whether two fits have the tracks at other places of the body."""
+    """Tell whether two fits have the tracks at different places of the body."""
     both = [label for label in one.layout.labels if label in other.layout.labels]
     places = [fit.layout.select(both).skin_points(model.template.vertices) for fit in (one, other)]
     return bool(np.median(np.linalg.norm(places[0] - places[1], axis=1)) > LIKE)
@@ -279,11 +295,11 @@ def _differs(model: BodyModel, one: PersonFit, other: PersonFit) -> bool:
 
 def _collect(model: BodyModel, tracks: MarkerSequence, fit: PersonFit, margin: float, usual: dict[str, str]
              ) -> FoundLayout:
-    """The result: tracks that are no markers left out, those that are one marker joined."""
+    """Collect the result: leave out tracks that are no markers, and join those of one marker."""
     left_out, kept = {}, []
     for row, label in enumerate(fit.layout.labels):
         off = float(np.nanmedian(fit.residuals[:, row]))
-        # metres, median distance from its place on which a track is no marker
+        # 35 mm: a track with a larger median distance from its place is no marker
         if off > 0.035:
             left_out[label] = f"{1000 * off:.0f} mm from the body"
         else:
@@ -294,7 +310,7 @@ def _collect(model: BodyModel, tracks: MarkerSequence, fit: PersonFit, margin: f
     seen = tracks.select(kept).seen
     groups: dict[str, list[str]] = {}
     for row, label in enumerate(kept):
-        # metres between the places of two tracks, never seen together, that are one marker
+        # 25 mm: two tracks this close, which are never seen together, are one marker
         other = next((first for first in groups if np.linalg.norm(
             places[kept.index(first)] - places[row]) < 0.025 and not (seen[:, kept.index(first)] & seen[:, row]).any()),
             None)
@@ -302,7 +318,7 @@ def _collect(model: BodyModel, tracks: MarkerSequence, fit: PersonFit, margin: f
     layout = replace(layout.select(list(groups)), loose=())
     rows = [fit.layout.labels.index(label) for label in layout.labels]
     spread = np.sqrt(np.nanmean(fit.residuals[:, rows]**2, axis=0))
-    # metres that a place is uncertain by, beside what its residuals tell: of a marker of a usual set, and of another
+    # uncertainty beside the residuals: 9 mm for a marker of a known set, 25 mm for another
     uncertainty = np.where([label in usual for label in layout.labels], 0.009, 0.025) + spread
     names = suggest_names(model, layout, usual)
     return FoundLayout(replace(layout, labels=names), dict(zip(names, map(tuple, groups.values()), strict=True)),
@@ -310,7 +326,7 @@ def _collect(model: BodyModel, tracks: MarkerSequence, fit: PersonFit, margin: f
 
 
 def suggest_names(model: BodyModel, layout: MarkerLayout, usual: dict[str, str]) -> tuple[str, ...]:
-    """Names of markers by anatomy: those of a usual set, label -> label, else the part and a number."""
+    """Return names of markers: those of a known set, label -> label, else the part and a number."""
     parts = model.skeleton.part_of_vertex(model.template)[layout.nearest]
     names, counts = list[str](), dict[int, int]()
     for label, part in zip(layout.labels, parts.tolist(), strict=True):

@@ -1,4 +1,4 @@
-"""A recording from the file without labels to the files with them: the labelled points, the table, the page."""
+"""The work of `scape label` on one recording: read, label, write the recording, the table and the page."""
 from __future__ import annotations
 
 from dataclasses import dataclass
@@ -21,12 +21,12 @@ __all__ = ["DOUBTFUL", "LABELLED_SHARE", "LabelWork"]
 
 @dataclass(frozen=True, eq=False)
 class LabelWork:
-    """What is the same for all recordings of a call of `scape label`."""
+    """Settings that all recordings of a call of `scape label` share."""
 
     model: BodyModel
-    name: str                            # of the model, for the output
-    subject: Subject | None              # None: to be found from the points
-    layout: str | Path | None            # a named one, or a file; None: the one that labels of the recording tell
+    name: str                            # name of the model, for the output
+    subject: Subject | None              # None: found from the points
+    layout: str | Path | None            # a name or a file; None: the one that the recording's labels suggest
     people: int
     labels: Path | None                  # table of corrections
     relabel: bool
@@ -34,11 +34,11 @@ class LabelWork:
     rate: float | None
 
     def __call__(self, path: Path, room: TaskContext) -> list[Metric]:
-        """Label a recording into the folder of a room; the figures, the first says what the labels are worth."""
+        """Label a recording into the folder of a task; return the figures, the judgement first."""
         return self.write(path, room, LABELLED, TABLE, "report.html")
 
     def write(self, path: Path, room: TaskContext, recording: str, table: str, page: str) -> list[Metric]:
-        """The same under other names of the three files."""
+        """Label a recording, with given names of the three files."""
         points = read_marker_points(path, self.unit, self.rate)
         layout, name = self._layout(points.labels)
         found = label_recording(path, points, self.subject or self.model, layout, self.people, self.labels,
@@ -50,7 +50,7 @@ class LabelWork:
         return metrics
 
     def _layout(self, labels: tuple[str, ...]) -> tuple[MarkerLayout, str]:
-        """The layout that is named, or the one that some labels of a recording tell, and its name."""
+        """Return the named layout, or the one that labels of the recording suggest, and its name."""
         if self.layout is not None:
             return choose_layout(self.model, self.layout, ())
         bare = [label.rpartition(":")[2] for label in labels]

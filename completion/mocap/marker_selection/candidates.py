@@ -1,4 +1,4 @@
-"""Symmetric places for markers, spread over the skin, of which a marker set may be chosen."""
+"""Candidate markers: symmetric places, spread over the skin, from which a marker set is chosen."""
 from __future__ import annotations
 
 from collections import Counter
@@ -24,10 +24,10 @@ if TYPE_CHECKING:
 
 def candidate_layout(body: BodyModel | Mesh, base: MarkerLayout, count: int = 114,
                      mirror: SkinMirror | None = None, skeleton: Skeleton | None = None) -> MarkerLayout:
-    """A marker set and more markers, each as far along the skin from all others as can be, the same left and right.
+    """Extend a marker set by markers as far along the skin from all others as possible, symmetric left and right.
 
-    A marker that the base has on one side only gets its partner first. New markers are called after the part that
-    they sit on, with L, R or M in front.
+    First, markers that the base has on one side only get their partner. New markers are named after their part, with L,
+    R or M in front.
 
     Parameters
     ----------
@@ -70,23 +70,26 @@ def candidate_layout(body: BodyModel | Mesh, base: MarkerLayout, count: int = 11
     if count < len(whole.labels):
         raise ValueError(f"count: expected at least the {len(whole.labels)} markers of the base with their partners, "
                          f"got {count}")
+    # new places, far from all others
     places = _spread(body, mirror, turn * mirror.across, count - len(whole.labels), whole.nearest)
     vertices = np.array([v for place in places for v in place], dtype=np.int64)
     return whole.merge(MarkerLayout(tuple(_names(body, skeleton, places)), vertices))
 
 
 def sitting_room(body: Mesh, mirror: SkinMirror, thick: float = 0.022) -> np.ndarray:
-    """(N,) bool where a marker can sit: open to cameras, flat, on a thick enough limb, not on the soles.
+    """Return a mask (N,) of vertices where a marker can sit: visible to cameras, flat, on thick limbs, not on soles.
 
-    Lengths are shares of the body's; at least `thick` is below a marker: fingers, toes and ears are less.
+    Lengths are shares of the body's length. The body is at least `thick` below a marker; fingers and ears are not.
     """
+    # shares of the length: 2.5% of either end with a normal along the axis is sole or crown; skin within 6% may hide a
+    # marker from cameras
     axis, length = _long_axis(body, mirror)
     along = body.vertices @ axis
     near_end = np.minimum(along - along.min(), along.max() - along) < 0.025 * length
-    at_end = near_end & (np.abs(body.vertex_normals @ axis) > 0.5)    # the soles and the crown face outwards there
-    reach, normals = 0.06 * length, body.vertex_normals               # skin that is nearer hides a marker from cameras
+    at_end = near_end & (np.abs(body.vertex_normals @ axis) > 0.5)
+    reach, normals = 0.06 * length, body.vertex_normals
 
-    # weights (N, N) of the vertices around every vertex, by their areas
+    # flatness: cosine between a normal and the mean normal of its surroundings, weighted by area
     i, j = cKDTree(body.vertices).query_pairs(thick * length, output_type="ndarray").T
     each = np.arange(len(body.vertices))
     i, j = np.r_[i, j, each], np.r_[j, i, each]
@@ -94,8 +97,8 @@ def sitting_room(body: Mesh, mirror: SkinMirror, thick: float = 0.022) -> np.nda
     around = diags_array(1 / np.maximum(near.sum(axis=1), 1e-30)) @ near
     flatness = np.einsum("nd,nd->n", normals, around @ normals)
 
-    # directions outwards, those along the normal weigh more: as many as the skin there sees of a lit sky; in armpits,
-    # the crotch and between fingers less than three quarters of them are free
+    # openness: share of 48 cosine-weighted outward rays that hit nothing; it is below 3/4 in armpits, in the crotch and
+    # between fingers
     rays, n = Rays(body), 48
     origins, directions = _fans(body, np.sqrt((np.arange(n) + 0.5) / n))
     lifted = origins + 1e-4 * reach * np.repeat(normals, n, axis=0)
@@ -103,7 +106,7 @@ def sitting_room(body: Mesh, mirror: SkinMirror, thick: float = 0.022) -> np.nda
     closed = np.flatnonzero(around @ openness < 0.75)
     away = SurfaceGraph(body).nearest(closed)[0] if len(closed) else np.inf
 
-    # thickness: the median of a third as many directions inwards, to the skin on the other side, at most the reach
+    # thickness: median length of 16 inward rays to the skin on the other side, at most the reach
     n = 16
     origins, directions = _fans(body, 1 - (1 - 0.5) * (np.arange(n) + 0.5) / n)
     hit = rays.cast(origins - 1e-4 * reach * np.repeat(normals, n, axis=0), -directions, reach)[1]
@@ -113,19 +116,19 @@ def sitting_room(body: Mesh, mirror: SkinMirror, thick: float = 0.022) -> np.nda
 
 def _spread(body: Mesh, mirror: SkinMirror, across: np.ndarray, count: int, taken: np.ndarray
             ) -> list[tuple[int, ...]]:
-    """Places one by one, (left, right) or (middle,), until there are `count` vertices, far from those `taken`.
+    """Choose places one by one, (left, right) or (middle,), up to `count` vertices, far from those `taken`.
 
-    `across` (N,) is how far every vertex is from the other side, positive on the left, metres.
+    `across` (N,), metres, is the distance of every vertex from its mirror image, positive on the left.
     """
     graph, partner, length = SurfaceGraph(body), mirror.partner, _long_axis(body, mirror)[1]
     free = sitting_room(body, mirror)
     free &= free[partner]
     on_line = np.abs(across) < float(np.linalg.norm(np.diff(body.vertices[body.edges], axis=1), axis=-1).mean())
     from_line = graph.nearest(np.flatnonzero(on_line))[0]
-    on_left = free & (across > 0) & (from_line > 0.012 * length)        # nearer ones are alone
+    on_left = free & (across > 0) & (from_line > 0.012 * length)        # closer to the line a marker has no partner
     near, found = graph.nearest(taken)[0], list[tuple[int, ...]]()
     while (left := count - sum(map(len, found))) > 0:
-        # a place is from its partner, along the skin, twice as far as from the line
+        # distance to all markers, for a pair also to its partner, which is twice as far as the middle line
         both = np.where(on_left, np.minimum(np.minimum(near, near[partner]), 2 * from_line), 0.0)
         alone = np.where(free & on_line, near, 0.0)
         paired = left > 1 and both.max() >= alone.max()
@@ -138,7 +141,7 @@ def _spread(body: Mesh, mirror: SkinMirror, across: np.ndarray, count: int, take
 
 
 def _names(body: Mesh, skeleton: Skeleton | None, places: list[tuple[int, ...]]) -> list[str]:
-    """Labels of new markers: side, part, number."""
+    """Return the labels of new markers: side, part, number."""
     parts = None if skeleton is None else skeleton.part_of_vertex(body)
     counts, labels = Counter[str](), list[str]()
     for place in places:
@@ -151,7 +154,7 @@ def _names(body: Mesh, skeleton: Skeleton | None, places: list[tuple[int, ...]])
 
 
 def _long_axis(body: Mesh, mirror: SkinMirror) -> tuple[np.ndarray, float]:
-    """The direction in the plane of symmetry along which the body is longest, and its extent, metres."""
+    """Return the direction in the plane of symmetry along which the body is longest, and its length, metres."""
     across = (body.vertices - mirror.image(body)).T @ mirror.across
     across /= np.linalg.norm(across)
     x = body.vertices - body.vertices.mean(axis=0)
@@ -161,12 +164,13 @@ def _long_axis(body: Mesh, mirror: SkinMirror) -> tuple[np.ndarray, float]:
 
 
 def _fans(body: Mesh, z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Origins and unit directions (N·n, 3) about the normal of every vertex; `z` (n,) their cosines with it."""
+    """Return origins and unit directions (N·n, 3) about the normal of every vertex, with cosines `z` (n,) to it."""
+    # a Fibonacci spiral about the z axis, in frames whose z is the normal; the first edge makes them turn with the body
     turn = np.arange(len(z)) * np.pi * (3 - np.sqrt(5))
     local = np.stack([np.sqrt(1 - z**2) * np.cos(turn), np.sqrt(1 - z**2) * np.sin(turn), z], axis=1)
     n, neighbour = body.vertex_normals, np.zeros(len(body.vertices), dtype=np.int64)
     neighbour[body.edges[:, 0]], neighbour[body.edges[:, 1]] = body.edges[:, 1], body.edges[:, 0]
-    first = body.vertices[neighbour] - body.vertices                   # turns with the body
+    first = body.vertices[neighbour] - body.vertices
     first = first - np.einsum("nd,nd->n", first, n)[:, None] * n
     first /= np.maximum(np.linalg.norm(first, axis=1, keepdims=True), 1e-12)
     frames = np.stack([first, np.cross(n, first), n], axis=1)

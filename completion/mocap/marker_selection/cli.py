@@ -61,13 +61,14 @@ def design(bodies: Path, output: Output, model: ModelOrNone = None, candidates: 
         if kept is not None and not set(kept.labels) <= set(among.labels):
             among = among.merge(kept.without([label for label in kept.labels if label in among.labels]))
     labels = () if kept is None else kept.labels
+    # bodies, posed if wanted, and the partners of the candidates
     found, people = _read_bodies(loaded, bodies, unit)
     if config.poses:
         with bar("posing the bodies") as progress:
             found = in_poses(loaded, found, example_poses(loaded, config.poses), progress).reshape(-1, *found.shape[1:])
         people = np.repeat(people, config.poses)
     partners = label_pairs(among.labels)
-    if (partners == np.arange(len(partners))).all():                 # labels that name no sides at all
+    if (partners == np.arange(len(partners))).all():                 # labels without sides
         partners = marker_pairs(among, loaded.template)
     with bar("choosing markers") as progress:
         result = design_markers(loaded, found, among, config, progress, keep=labels, partners=partners, people=people)
@@ -79,7 +80,7 @@ def design(bodies: Path, output: Output, model: ModelOrNone = None, candidates: 
                *(Metric(f"{c.count} markers by full refits", 1000 * c.full, "mm") for c in result.checks)]
     output.mkdir(parents=True, exist_ok=True)
     result.layout.save(output / "layout.json")
-    # the curves: which one, markers, RMSE in millimetres, and the labels that came or went
+    # the curves as CSV: name, markers, RMSE in millimetres, and the labels that were added or removed
     lines = ["curve,markers,rmse_mm,labels"]
     for curve in result.curves:
         steps = zip(((), *curve.steps), curve.counts.tolist(), (1000 * curve.rmse).tolist(), strict=True)
@@ -91,7 +92,7 @@ def design(bodies: Path, output: Output, model: ModelOrNone = None, candidates: 
 
 
 def _read_bodies(model: BodyModel, folder: Path, unit: Unit | None) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices (Z, N, 3) of a folder or a set, and whose each is (Z,)."""
+    """Read vertices (Z, N, 3) from a folder or a set, and the person (Z,) of each body."""
     if (folder / "set.json").exists():
         whole = RegisteredSet.load(folder)
         faces, vertices = whole.template.faces, whole.vertices(tuple(entry.name for entry in whole.entries))
@@ -106,7 +107,7 @@ def _read_bodies(model: BodyModel, folder: Path, unit: Unit | None) -> tuple[np.
 
 
 def chart_curve(design: MarkerDesign) -> Any:
-    """A matplotlib figure: the error over the number of markers."""
+    """Plot the error over the number of markers."""
     from matplotlib.figure import Figure
     from matplotlib.ticker import NullLocator, ScalarFormatter
 
@@ -131,7 +132,7 @@ def chart_curve(design: MarkerDesign) -> Any:
 
 def design_page(design: MarkerDesign, model: BodyModel, candidates: MarkerLayout, keep: tuple[str, ...],
                 metrics: Sequence[Metric]) -> Page:
-    """The page of `scape layout design`."""
+    """Make the page of `scape layout design`."""
     page = Page(f"{len(design.layout.labels)} markers", "Chosen so that bodies estimated from them are near the true "
                 "ones over their whole surface. Red: chosen; blue: kept; grey: left out.")
     body, labels = at_rest(model), np.array(candidates.labels)

@@ -1,4 +1,4 @@
-"""Which markers to put on: the set from which bodies are estimated best."""
+"""Design a marker set: find the markers from which bodies are estimated best."""
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
@@ -17,16 +17,16 @@ from .linear import LinearBodies, fit_bodies, share_betas
 
 @dataclass(frozen=True, eq=False)
 class DesignCurve:
-    """Sets of markers of many sizes, each the one before and a marker, or a pair, more or less."""
+    """Marker sets of many sizes, each with one marker, or pair, more or less than the one before."""
 
-    name: str                        # "removed" from all, "added" to those kept, or "kept, removed": these made fewer
-    start: tuple[str, ...]           # of the first set
-    steps: tuple[tuple[str, ...], ...]    # labels that came or went in every step
+    name: str                        # "removed" from all, "added" to kept ones, or "kept, removed": from the kept ones
+    start: tuple[str, ...]           # labels of the first set
+    steps: tuple[tuple[str, ...], ...]    # labels added or removed in every step
     counts: np.ndarray               # (S,) int, markers of each set, the first included
-    rmse: np.ndarray                 # (S,), metres: over all vertices and bodies, linearised
+    rmse: np.ndarray                 # (S,), metres, over all vertices and bodies, linearised
 
     def labels(self, count: int) -> tuple[str, ...]:
-        """The set with that many markers, or the most below it."""
+        """Return the set with `count` markers, or the largest smaller one."""
         below = np.flatnonzero(self.counts <= count)
         if not len(below):
             raise ValueError(f"count: expected at least {self.counts.min()}, got {count}")
@@ -38,16 +38,16 @@ class DesignCurve:
 
 @dataclass(frozen=True, eq=False)
 class Check:
-    """A set of markers, its bodies estimated again without linearising."""
+    """A marker set, with bodies estimated again without linearisation."""
 
     count: int
-    linearised: float                # metres, root mean squared distance over all vertices and bodies
-    full: float                      # metres, the same by a full refit
+    linearised: float                # metres, RMSE over all vertices and bodies
+    full: float                      # metres, RMSE by full refits
 
 
 @dataclass(frozen=True, eq=False)
 class MarkerDesign:
-    """A set of markers and how it was found.
+    """A marker set, and how it was found.
 
     Attributes
     ----------
@@ -56,16 +56,16 @@ class MarkerDesign:
     rmse : float, metres
         Over all vertices and bodies, estimated from these markers, linearised.
     full : float, optional, metres
-        The same by full refits; none where bodies of a person share betas.
+        RMSE by full refits; None where bodies of a person share betas.
     floor : float, metres
-        What the model leaves of the bodies when it sees all of their surface.
+        RMSE of the model fitted to the whole surface of the bodies.
     other_half : float, metres
-        With sets chosen on one half of the bodies, measured on the other half; a set that only suits the bodies it
-        was chosen on has much more than `rmse`.
-    curves : tuple of Curve
+        RMSE on one half of the bodies of sets chosen on the other half; it is much larger than `rmse` for a set that
+        only suits the bodies it was chosen on.
+    curves : tuple of DesignCurve
     checks : tuple of Check
     exchanged : int
-        Groups exchanged after the last step.
+        Number of exchanged groups after the last step.
     """
 
     layout: MarkerLayout
@@ -78,12 +78,12 @@ class MarkerDesign:
     exchanged: int
 
 
-FEWEST = 3                           # markers below which a body has no place
+FEWEST = 3                           # least markers; fewer do not determine the place of a body
 
 
 @dataclass(frozen=True, eq=False)
 class Choice:
-    """What the search for one set found."""
+    """The result of the search for one set."""
 
     paths: dict[str, Path]
     groups: np.ndarray               # (n,) int, of the set
@@ -94,11 +94,11 @@ class Choice:
 def design_markers(model: BodyModel, bodies: np.ndarray, candidates: MarkerLayout, config: DesignConfig | None = None,
                    progress: Progress | None = None, *, keep: Sequence[str] = (),
                    partners: np.ndarray | None = None, people: np.ndarray | None = None) -> MarkerDesign:
-    """The set of markers from which the model estimates the whole surface of some bodies best.
+    """Find the marker set from which the model estimates the whole surface of some bodies best.
 
-    Every body is estimated from each set by itself, with the priors of shape and pose and with markers where the
-    body has them on its skin. Estimates are linearised around the fit to the whole body; sets are made by taking away
-    and adding the marker, or pair, that serves best, and at last by exchanges.
+    Every body is estimated from each set by itself, with the priors of shape and pose, and markers at their places on
+    its skin. Estimates are linearised around the fit to the whole body. Sets are made by removing and adding the best
+    marker, or pair, and at last by exchanges.
 
     Parameters
     ----------
@@ -107,21 +107,39 @@ def design_markers(model: BodyModel, bodies: np.ndarray, candidates: MarkerLayou
     bodies : (Z, N, 3) float, metres
         In the topology of the model's template, in any poses.
     candidates : MarkerLayout
+        C markers to choose from.
     config : DesignConfig, optional
+        Settings.
     progress : callable, optional
         Called with (done, total).
-    keep : labels, optional
+    keep : sequence of labels, optional
         Candidates that stay in the set, with their partners.
     partners : (C,) int, optional
-        The candidate on the other side, which comes and goes with it, as `marker_pairs` finds it by place; without it
-        labels tell.
+        Partner of each candidate on the other side, which is added and removed with it, as by `marker_pairs`; without
+        it, partners follow from labels.
     people : (Z,) int, optional
-        Whose body each is; else the first half of the bodies are other people than the second.
+        The person of each body; else the first half of the bodies counts as other people than the second.
+
+    Returns
+    -------
+    MarkerDesign
+        The layout, and errors in metres.
 
     Raises
     ------
     ValueError
-        A model without betas, bodies of another shape, a count that cannot be had, unknown labels.
+        A model without betas, bodies of another shape, an impossible count, unknown labels.
+
+    Examples
+    --------
+    >>> from completion import load_layout
+    >>> from model import load_built_in_model
+    >>> model = load_built_in_model()
+    >>> among = load_layout("cmu41", model.template, np.array(model.info["people_vertices"]))
+    >>> bodies = np.stack([model.vertices(model.pose_mean, betas) for betas in np.eye(2)])
+    >>> quick = DesignConfig(count=6, n_betas=2, surface=100, exchanges=0)
+    >>> len(design_markers(model, bodies, among, quick).layout.labels)
+    6
 
     [MoSh] Eq. 25, Eq. 26, Eq. 27
     """
@@ -130,6 +148,7 @@ def design_markers(model: BodyModel, bodies: np.ndarray, candidates: MarkerLayou
     kept = _groups_to_keep(candidates, groups, keep, config)
     if config.joint and people is None:
         raise ValueError("people: expected whose body each is, for betas that are common to a person's bodies")
+    # fit and linearise, and split the people into halves
     total = 2 * len(bodies) + 2 * len(candidates.labels)
     tell = progress or (lambda done, total: None)
     fits = fit_bodies(model, bodies, candidates, config, lambda done, _: tell(done, total))
@@ -151,7 +170,7 @@ def design_markers(model: BodyModel, bodies: np.ndarray, candidates: MarkerLayou
                                                             choose(linear.of(mine), groups, kept, config).groups))))
     tell(total, total)
 
-    # the same without linearising
+    # errors of the set, and of some sets of the curve, without linearisation
     def refitted(chosen: list[int]) -> float:
         return float(np.sqrt(vertex_errors(model, fits.refit(chosen, config), bodies).mean()))
 
@@ -162,6 +181,7 @@ def design_markers(model: BodyModel, bodies: np.ndarray, candidates: MarkerLayou
             path = best_path(choice.paths, count)
             at = path.at(count)
             checks.append(Check(int(path.counts[at]), float(path.rmse[at]), refitted(_members(groups, path.set(at)))))
+    # collect the result, with labels in place of numbers
     labels = candidates.labels
     curves = tuple(DesignCurve(name, tuple(labels[i] for i in _members(groups, path.start)),
                                tuple(tuple(labels[i] for i in groups[g]) for g in path.steps), path.counts, path.rmse)
@@ -174,7 +194,7 @@ def design_markers(model: BodyModel, bodies: np.ndarray, candidates: MarkerLayou
 
 def choose(linear: LinearBodies, groups: Groups, kept: np.ndarray, config: DesignConfig,
            tell: Callable[[int], None] | None = None) -> Choice:
-    """The set of `config.count` markers, with groups `kept` (n,) in it, and the curves it comes from."""
+    """Search the set of `config.count` markers that contains groups `kept` (n,); return it with the curves."""
     every, free, step = np.arange(len(groups)), ~kept, [0]
     stops = {config.count, *config.through}
 
@@ -183,10 +203,12 @@ def choose(linear: LinearBodies, groups: Groups, kept: np.ndarray, config: Desig
         if tell is not None:
             tell(step[0])
 
+    # from all candidates downwards, and from the kept ones upwards
     paths = {"removed": improve_set(MarkerSets(linear, groups, every), REMOVE, free, FEWEST, stops, told),
              "added": improve_set(MarkerSets(linear, groups, np.flatnonzero(kept)), ADD, free, sum(map(len, groups)),
                                   stops,
                                   told)}
+    # the better curve, improved by exchanges
     best = best_path(paths, config.count)
     sets = MarkerSets(linear, groups, best.set(best.at(config.count)))
     exchanged = exchange(sets, free, config.exchanges)
@@ -198,13 +220,13 @@ def choose(linear: LinearBodies, groups: Groups, kept: np.ndarray, config: Desig
 
 
 def best_path(paths: dict[str, Path], count: int) -> Path:
-    """Of those that have a set with that many markers, or nearly, the one with the least error there."""
-    found = [path for path in paths.values() if path.at(count) >= 0]
-    return min(found, key=lambda path: (-path.counts[path.at(count)], path.rmse[path.at(count)]))
+    """Return the path with a set of `count` markers, or nearly as many, that has the least error there."""
+    possible = [path for path in paths.values() if path.at(count) >= 0]
+    return min(possible, key=lambda path: (-path.counts[path.at(count)], path.rmse[path.at(count)]))
 
 
 def _groups_to_keep(candidates: MarkerLayout, groups: Groups, keep: Sequence[str], config: DesignConfig) -> np.ndarray:
-    """(n,) bool: groups that stay."""
+    """Return a mask (n,) of groups that stay; ValueError for unknown labels or an impossible count."""
     unknown = [label for label in keep if label not in candidates.labels]
     if unknown:
         raise ValueError(f"keep: {', '.join(unknown)} not among the candidates")
@@ -217,4 +239,5 @@ def _groups_to_keep(candidates: MarkerLayout, groups: Groups, keep: Sequence[str
 
 
 def _members(groups: Groups, chosen: np.ndarray) -> list[int]:
+    """Return the markers of chosen groups, in rising order."""
     return sorted(i for g in chosen for i in groups[g])

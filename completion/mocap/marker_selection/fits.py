@@ -1,4 +1,4 @@
-"""The model fitted to many bodies at once: to whole ones, or to some of their points."""
+"""Fit the model to many bodies at once: to their whole surface, or to some of their points."""
 from __future__ import annotations
 
 from collections.abc import Callable
@@ -21,30 +21,30 @@ from scanprep.ranges import FLAG, Count, Positive, Settings
 class DesignConfig(Settings):
     """Settings of `design_markers`.
 
-    Eq. 26 has no prior; without one fewer markers than a third of the unknowns have no answer. So betas are held to
-    the mean person and poses to the usual ones, as far as `marker_sd` lets them.
+    [MoSh] Eq. 26 has no prior, so it is undetermined with fewer markers than a third of the unknowns. Here priors hold
+    betas near the mean person and poses near usual ones, balanced by `marker_sd`.
 
     Attributes
     ----------
     count : int
-        Markers of the set that is wanted.
+        Number of markers of the set.
     through : ints
-        Further counts at which the curve must have a set of just that size; pairs go two at a time.
+        Further counts at which the curve must have a set of exactly that size; pairs change it by two.
     poses : int
-        Different poses that the model was learned from, into which `scape layout design` puts each body; 0 takes the
-        bodies as they are.
+        Number of poses of the model's training set into which `scape layout design` puts each body; 0 keeps the bodies
+        as they are.
     n_betas : int, optional
-        Betas that are estimated, the first ones; all when not given.
+        Number of betas that are estimated; all when not given.
     joint : bool
-        Betas are common to the bodies of a person; else each body is estimated by itself, as in the paper.
+        Bodies of a person share betas; else each body is estimated by itself, as in the paper.
     marker_sd : float, metres
-        How far a marker may lie from where the body would put it.
+        Standard deviation of a marker from its simulated place.
     surface : int
-        Vertices, well spread, that stand for all of them while sets are compared, each for those nearest to it.
+        Number of spread vertices that represent the surface while sets are compared, each for those nearest to it.
     exchanges : int
-        Rounds in which each marker of the set, or pair, is tried against those left out.
+        Rounds in which each marker of the set, or pair, is compared with those left out.
     checks : ints
-        Counts at which the set of the curve is estimated again without linearising.
+        Counts at which the set of the curve is estimated again without linearisation.
     """
 
     count: Annotated[Count, FLAG] = 47
@@ -68,21 +68,21 @@ class BodyPoints:
         self.n_unknowns = self.n_angles + 3 + self.n_betas
 
     def some(self, chosen: np.ndarray) -> BodyPoints:
-        """Some of the points."""
+        """Return some of the points."""
         return BodyPoints(self.shaped.combine(combination_weights(self.count, np.arange(self.count)[chosen], None)))
 
     @property
     def batch(self) -> int:
-        """Bodies whose derivatives are held at once."""
-        # numbers of a batch of derivatives
+        """Bodies whose derivatives are in memory at once: 2**25 numbers, 256 MB."""
         return max(1, 2**25 // max(1, 3 * self.count * (self.n_unknowns + self.shaped.load)))
 
     def _split(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Split unknowns (B, P) into poses, places and betas."""
         n = self.n_angles
         return x[:, :n].reshape(len(x), -1, 3), x[:, n:n + 3], x[:, n + 3:]
 
     def positions(self, x: np.ndarray) -> np.ndarray:
-        """(B, L, 3) metres, for unknowns (B, P)."""
+        """Compute points (B, L, 3), metres, for unknowns (B, P)."""
         out = np.empty((len(x), self.count, 3))
         for start in range(0, len(x), self.batch):
             pose, trans, betas = self._split(x[start:start + self.batch])
@@ -91,7 +91,7 @@ class BodyPoints:
         return out
 
     def follow(self, x: np.ndarray) -> MovingPoints:
-        """The points with their derivatives by the unknowns (B, P); keep B small."""
+        """Compute the points with their derivatives by the unknowns (B, P); keep B small."""
         pose, trans, betas = self._split(x)
         found = [self.shaped.operator(own).columns(p, t) for own, p, t in zip(betas, pose, trans, strict=True)]
         by_pose = np.swapaxes(np.stack([columns for _, columns in found]), 1, 3)
@@ -100,31 +100,31 @@ class BodyPoints:
 
 @dataclass(frozen=True, eq=False)
 class Prior:
-    """What is known of the unknowns x of a body before it is measured: a Gaussian."""
+    """Gaussian prior of the unknowns x of a body."""
 
     precision: np.ndarray            # (P, P) float
-    # (Z, P) float: One for each body: its root and its place are known to a radian and a metre, loosely enough to say
-    # nothing once there are three markers
+    # (Z, P) float, one for each body: root and place have a standard deviation of a radian and a metre, so loose that
+    # they do not matter with three markers
     mean: np.ndarray
 
     def system(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Energy (Z,) and half its gradient (Z, P) at x (Z, P)."""
+        """Compute the energy (Z,) and half its gradient (Z, P) at x (Z, P)."""
         slope = (x - self.mean) @ self.precision
         return ((x - self.mean) * slope).sum(axis=1), slope
 
     def of(self, some: slice) -> Prior:
-        """That of some of the bodies."""
+        """Return the prior of some of the bodies."""
         return Prior(self.precision, self.mean[some])
 
 
 def prior_around(model: BodyModel, x: np.ndarray, shape_weight: float = 1.0) -> Prior:
-    """The prior of bodies that stand and face about as at x (Z, P). [MoSh] Eq. 20, Eq. 21"""
+    """Build the prior of bodies with place and orientation near those of x (Z, P). [MoSh] Eq. 20, Eq. 21"""
     poses = gaussian_prior(model.pose_mean, model.pose_covariance)
     n, P = len(poses.mean), x.shape[1]
     precision = np.zeros((P, P))
     precision[:n, :n] = poses.whitening.T @ poses.whitening
     place = np.r_[:3, n:n + 3]
-    precision[place, place] += 1.0                       # known to a metre and a radian beforehand
+    precision[place, place] += 1.0                       # standard deviations of a metre and a radian
     precision[np.arange(n + 3, P), np.arange(n + 3, P)] = shape_weight
     mean = np.zeros_like(x)
     mean[:, :n] = poses.mean
@@ -134,30 +134,30 @@ def prior_around(model: BodyModel, x: np.ndarray, shape_weight: float = 1.0) -> 
 
 def fit_points(points: BodyPoints, targets: np.ndarray, weights: np.ndarray, prior: Prior, start: np.ndarray,
                iterations: int, tell: Callable[[int], None] | None = None) -> np.ndarray:
-    """Unknowns (Z, P) with which points come nearest to targets (Z, L, 3), metres, weighted (L,). [MoSh] Eq. 26"""
-    root, found = np.sqrt(weights)[:, None], np.empty_like(start)
-    size = min(24, points.batch)  # bodies that are minimised at once
+    """Fit unknowns (Z, P) to targets (Z, L, 3), metres, with weights (L,). [MoSh] Eq. 26"""
+    root, solution = np.sqrt(weights)[:, None], np.empty_like(start)
+    size = min(24, points.batch)  # bodies that are fitted at once
     for begin in range(0, len(start), size):
         some = slice(begin, begin + size)
-        goal, known = targets[some], prior.of(some)
+        goal, prior_of_batch = targets[some], prior.of(some)
 
-        def system(x: np.ndarray, goal: np.ndarray = goal, known: Prior = known) -> Dense:
+        def system(x: np.ndarray, goal: np.ndarray = goal, prior_of_batch: Prior = prior_of_batch) -> Dense:
             at = points.follow(x)
             residual = (root * (at.positions - goal)).reshape(len(x), -1, 1)
             J = (root[..., None] * at.jacobian).reshape(len(x), -1, x.shape[1])
             transposed = np.swapaxes(J, -1, -2)
-            energy, slope = known.system(x)
+            energy, slope = prior_of_batch.system(x)
             return Dense((residual**2).sum(axis=(1, 2)) + energy, (transposed @ residual)[..., 0] + slope,
-                         transposed @ J + known.precision)
+                         transposed @ J + prior_of_batch.precision)
 
-        found[some] = levenberg_marquardt(system, start[some], iterations, 1e-4, angles=points.n_angles).x
+        solution[some] = levenberg_marquardt(system, start[some], iterations, 1e-4, angles=points.n_angles).x
         if tell is not None:
             tell(min(begin + size, len(start)))
-    return found
+    return solution
 
 
 def rough_poses(model: BodyModel, bodies: np.ndarray, n_betas: int) -> np.ndarray:
-    """Unknowns (Z, 3J + 3 + K) of the mean person whose parts are turned as those of bodies (Z, N, 3)."""
+    """Initialise unknowns (Z, 3J + 3 + K): the mean person with the rotations of the parts of bodies (Z, N, 3)."""
     J = len(model.skeleton.parents)
     rest = model.template.with_vertices(model.vertices(np.zeros((J, 3)), np.zeros(n_betas)))
     root = model.joint_regressor[[0]]
@@ -170,7 +170,7 @@ def rough_poses(model: BodyModel, bodies: np.ndarray, n_betas: int) -> np.ndarra
 
 
 def vertex_errors(model: BodyModel, x: np.ndarray, bodies: np.ndarray) -> np.ndarray:
-    """(Z,) mean squared distance, square metres, of all vertices of the bodies at x (Z, P) from the given ones."""
+    """Compute the mean squared distance (Z,), square metres, of all vertices at x (Z, P) from those of the bodies."""
     n = 3 * len(model.skeleton.parents)
     out = np.empty(len(x))
     for i, (row, body) in enumerate(zip(x, bodies, strict=True)):

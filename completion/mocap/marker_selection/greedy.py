@@ -1,4 +1,4 @@
-"""Sets of markers, made smaller or larger step by step, with all bodies and all candidates at once."""
+"""Greedy selection of marker sets, group by group, for all bodies and all candidates at once."""
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Sequence
@@ -11,13 +11,14 @@ from .linear import LinearBodies
 
 
 def symmetric_groups(labels: Sequence[str], partners: np.ndarray | None = None) -> tuple[tuple[int, ...], ...]:
-    """Numbers of the markers of each pair, and of each marker alone; `partners` (L,), else by label."""
+    """Return the numbers of the markers of each pair, and of each single marker; `partners` (L,), else by label."""
     partners = label_pairs(labels) if partners is None else np.asarray(partners, dtype=np.int64)
     each = np.arange(len(labels))
     if partners.shape != each.shape or partners.max(initial=-1) >= len(each):
         raise ValueError(f"partners: expected a marker, or -1, for each of {len(each)}, got shape {partners.shape} "
                          f"up to {partners.max(initial=-1)}")
     other = np.where(partners < 0, each, partners)
+    # partners have to be mutual
     wrong = np.flatnonzero(other[other] != each)
     if len(wrong):
         raise ValueError(f"partners: expected that the partner of {labels[other[wrong[0]]]} is {labels[wrong[0]]}, got "
@@ -26,37 +27,37 @@ def symmetric_groups(labels: Sequence[str], partners: np.ndarray | None = None) 
 
 
 Groups = Sequence[tuple[int, ...]]
-ADD, REMOVE = 1, -1
+ADD, REMOVE = 1, -1                  # the sign s of the update formulas
 
 
 @dataclass(frozen=True, eq=False)
 class Path:
-    """Sets of markers, each the one before and a group more or less."""
+    """Marker sets, each with one group more or less than the one before."""
 
     start: np.ndarray                # (m,) int, groups of the first set, in rising order
-    steps: tuple[int, ...]           # the group that came or went in each step
-    added: bool                      # they came
+    steps: tuple[int, ...]           # the group that was added or removed in each step
+    added: bool                      # groups were added
     counts: np.ndarray               # (S,) int, markers of each set, the first included
     rmse: np.ndarray                 # (S,) float, metres
 
     def set(self, i: int) -> np.ndarray:
-        """Groups of the i-th set, in rising order."""
+        """Return the groups of the i-th set, in rising order."""
         combine = np.union1d if self.added else np.setdiff1d
         return np.asarray(combine(self.start, np.array(self.steps[:i], dtype=np.int64)))
 
     def at(self, count: int) -> int:
-        """Which set has that many markers, or the most below it; -1 where all have more."""
+        """Return which set has `count` markers, or the most below it; -1 where all have more."""
         below = np.flatnonzero(self.counts <= count)
         return int(below[np.argmax(self.counts[below])]) if len(below) else -1
 
 
 class MarkerSets:
-    """A set of groups of markers, what it leaves of every body, and what each group more or less would do to that.
+    """A set of groups of markers, its error on every body, and the change of the error by adding or removing a group.
 
-    For a group with rows B that comes (s = +1) or goes (s = -1), with C the covariance of the step d and
+    For a group with rows B that is added (s = +1) or removed (s = -1), with C the covariance of the step d and
     `k = (I + s B C Bᵀ)⁻¹ (g - B d)`, the step becomes `d + s C Bᵀ k` and the cost changes by
-    `2 s k·q + kᵀ F k`, where `q = B C (G d - p)` and `F = B C G C Bᵀ`. What changes with C is kept for the rows of
-    each group alone, so trying all groups costs small solves only, and taking one costs one pass over the rows.
+    `2 s k·q + kᵀ F k`, where `q = B C (G d - p)` and `F = B C G C Bᵀ`. These are stored for the rows of each group. So
+    testing all groups costs small solves only, and a change of the set costs one pass over the rows.
 
     [MoSh] Eq. 26, Eq. 27
     """
@@ -74,7 +75,7 @@ class MarkerSets:
         self.renew()
 
     def renew(self) -> None:
-        """Solve from nothing, free of what updates have rounded."""
+        """Solve from scratch, without the rounding errors of updates."""
         linear, (Z, _, _, P) = self._linear, self._rows.shape
         members = [c for group, inside in zip(self._groups, self.inside, strict=True) if inside for c in group]
         B = linear.rows[:, members].reshape(Z, -1, P)
@@ -85,14 +86,14 @@ class MarkerSets:
         self._rho = self._gaps - (self._rows @ d[:, None, :, None])[..., 0]
         self._q = (self._rows @ (self._C @ slope)[:, None])[..., 0]
         self._S, self._F = np.empty((2, *self._gaps.shape, self._gaps.shape[-1]))
-        for z in range(Z):                               # one body after the other: the products are as large as rows
+        for z in range(Z):                               # one body at a time, as products are as large as the rows
             W = self._rows[z] @ self._C[z]
             self._S[z] = W @ np.swapaxes(self._rows[z], -1, -2)
             self._F[z] = (W @ linear.gram[z]) @ np.swapaxes(W, -1, -2)
 
     @property
     def count(self) -> int:
-        """Markers of the set."""
+        """Number of markers of the set."""
         return int(self.sizes[self.inside].sum())
 
     @property
@@ -101,7 +102,7 @@ class MarkerSets:
         return float(np.sqrt(self.costs.mean()))
 
     def score_groups(self, groups: np.ndarray, sign: int) -> np.ndarray:
-        """(n,) mean squared distance after each of some groups comes (+1) or goes (-1)."""
+        """Compute the mean squared distance (n,) after adding (+1) or removing (-1) each of some groups."""
         rho, S = self._rho[:, groups], self._S[:, groups]
         k = np.linalg.solve(np.eye(S.shape[-1]) + sign * S, rho[..., None])
         change = 2 * sign * (k[..., 0] * self._q[:, groups]).sum(axis=-1)
@@ -109,11 +110,12 @@ class MarkerSets:
         return np.asarray((self.costs[:, None] + change).mean(axis=0))
 
     def take(self, group: int, sign: int) -> None:
-        """Let a group come (+1) or go (-1)."""
+        """Add (+1) or remove (-1) a group, and update all stored products."""
         U = self._rows[:, group] @ self._C                                                # (Z, w, P)
         S, F, rho = self._S[:, group].copy(), self._F[:, group].copy(), self._rho[:, group, :, None].copy()
         M = np.linalg.inv(np.eye(S.shape[-1]) + sign * S)
         k = M @ rho
+        # products of all rows with those of the group, by C and by C G C
         both = np.concatenate([U, U @ self._linear.gram @ self._C], axis=1)
         found = self._rows @ np.swapaxes(both, -1, -2)[:, None]
         K, L = np.split(found, 2, axis=-1)                                                # B C Bᵀ, B C G C Bᵀ
@@ -123,6 +125,7 @@ class MarkerSets:
         behind = self._q[:, group, :, None] + sign * (F @ k)
         self._q += (sign * (L @ k[:, None] - KM @ behind[:, None]))[..., 0]
         self._rho -= (sign * (K @ k[:, None]))[..., 0]
+        # rank-one style updates (Woodbury) of S = B C Bᵀ, F = B C G C Bᵀ and C
         self._S -= sign * (KM @ np.swapaxes(K, -1, -2))
         cross = KM @ np.swapaxes(L, -1, -2)
         self._F += KM @ F[:, None] @ np.swapaxes(KM, -1, -2) - sign * (cross + np.swapaxes(cross, -1, -2))
@@ -130,19 +133,20 @@ class MarkerSets:
         self.inside[group] = sign == ADD
 
     def state(self) -> tuple[np.ndarray, ...]:
-        """What `put_back` takes to undo steps: updates there and back again would lose digits."""
+        """Return a copy of the state for `put_back`; undoing by updates would lose digits."""
         return tuple(a.copy() for a in (self.inside, self.costs, self._C, self._S, self._F, self._rho, self._q))
 
     def put_back(self, state: tuple[np.ndarray, ...]) -> None:
-        """Be again what it was; the state is used up."""
+        """Restore a state, which must not be used again."""
         self.inside, self.costs, self._C, self._S, self._F, self._rho, self._q = state
 
 
 def improve_set(sets: MarkerSets, sign: int, movable: np.ndarray, until: int, through: Collection[int] = (),
                 tell: Callable[[int], None] | None = None) -> Path:
-    """Let the group come or go that serves best for each of its markers, again and again.
+    """Add or remove the best group, by its effect per marker, again and again.
 
-    Only those of `movable` (n,), no further than `until`; it stops at counts of `through` that single markers can make.
+    Only groups of `movable` (n,) change, down or up to `until` markers. Counts in `through` are hit exactly where
+    single markers can do that.
     """
     start, steps = np.flatnonzero(sets.inside), list[int]()
     counts, rmse = [sets.count], [sets.rmse]
@@ -151,14 +155,16 @@ def improve_set(sets: MarkerSets, sign: int, movable: np.ndarray, until: int, th
         open_ = open_[sign * (sets.count + sign * sets.sizes[open_]) <= sign * until]
         if not len(open_):
             return Path(start, tuple(steps), sign == ADD, np.array(counts), np.array(rmse))
+        # do not step over a count of `through` with a pair if a single marker can move
         passed = np.array([any(0 < sign * (stop - sets.count) < size for stop in through)
                            for size in sets.sizes[open_]])
         open_ = open_ if passed.all() else open_[~passed]
         gain = (sets.score_groups(open_, sign) - sets.costs.mean()) / sets.sizes[open_]
         steps.append(int(open_[np.argmin(gain)]))
         sets.take(steps[-1], sign)
-        if sign == ADD and sets.count < 8:           # the first markers know the place a thousand times better
-            sets.renew()                             # than what was before, and updates lose as many digits
+        # the first markers determine the place a thousand times better than the prior, so updates lose digits
+        if sign == ADD and sets.count < 8:
+            sets.renew()
         counts.append(sets.count)
         rmse.append(sets.rmse)
         if tell is not None:
@@ -166,9 +172,9 @@ def improve_set(sets: MarkerSets, sign: int, movable: np.ndarray, until: int, th
 
 
 def exchange(sets: MarkerSets, movable: np.ndarray, rounds: int) -> int:
-    """Put every group of the set, and single ones two at a time, against all that may take its place, for some rounds.
+    """Try to exchange every group of the set, and single ones two at a time, for better ones, in some rounds.
 
-    A pair may make room for two single markers and the other way round; returned is how many exchanges were made.
+    A pair may be exchanged for two single markers and the other way round. Returned is the number of exchanges.
     """
     done = 0
     for _ in range(rounds):
@@ -188,8 +194,8 @@ def exchange(sets: MarkerSets, movable: np.ndarray, rounds: int) -> int:
 
 
 def _exchange(sets: MarkerSets, movable: np.ndarray, out: list[int]) -> bool:
-    """Let groups of the set go for what serves best in their place; put them back where nothing is better."""
-    before, enough = sets.state(), sets.costs.mean() * (1 - 1e-6)    # nothing is exchanged for a millionth less
+    """Exchange groups of the set for the best replacement; restore them where nothing is better."""
+    before, enough = sets.state(), sets.costs.mean() * (1 - 1e-6)    # least gain: a millionth, above rounding errors
     for group in out:
         sets.take(group, REMOVE)
     new = _fill(sets, movable, int(sets.sizes[out].sum()))
@@ -202,7 +208,7 @@ def _exchange(sets: MarkerSets, movable: np.ndarray, out: list[int]) -> bool:
 
 
 def _fill(sets: MarkerSets, movable: np.ndarray, size: int) -> list[int]:
-    """Let one group of that size come, or one marker after the other, whichever serves better; which they are."""
+    """Add one group of a size, or single markers in turn, whichever is better; return what was added."""
     whole, cost = _best(sets, movable, size)
     single, _ = _best(sets, movable, 1)
     if size == 1 or single < 0:
@@ -219,7 +225,7 @@ def _fill(sets: MarkerSets, movable: np.ndarray, size: int) -> list[int]:
 
 
 def _best(sets: MarkerSets, movable: np.ndarray, size: int) -> tuple[int, float]:
-    """The group of that size that would serve best, and the mean squared distance with it; -1 where there is none."""
+    """Return the best group of a size, and the mean squared distance with it; -1 where there is none."""
     open_ = np.flatnonzero(movable & ~sets.inside & (sets.sizes == size))
     if not len(open_):
         return -1, float("inf")

@@ -1,4 +1,4 @@
-"""Bodies estimated from markers, linearised around the fit to their whole surface."""
+"""Estimate bodies from markers, linearised around the fit to their whole surface."""
 from __future__ import annotations
 
 from collections.abc import Sequence
@@ -17,27 +17,27 @@ from ...motion import Progress
 from ..marker_sets.layout import MarkerLayout
 from .fits import BodyPoints, DesignConfig, Prior, fit_points, prior_around, rough_poses
 
-FIT_ITERATIONS = 20                  # most steps of that fit, and of a full refit
+FIT_ITERATIONS = 20                  # most steps of the fit to the whole surface, and of a full refit
 
 
 @dataclass(frozen=True, eq=False)
 class LinearBodies:
-    """Bodies whose every point is affine in a step d of their unknowns, near where the whole surface has them.
+    """Bodies whose points are affine in a step d of their unknowns, from the fit to the whole surface.
 
-    From markers T the step is `(Λ + Σ_T BᵀB)⁻¹ (l + Σ_T Bᵀ g)`, and leaves the surface a mean squared distance of
+    From markers T the step is `d = (Λ + Σ_T BᵀB)⁻¹ (l + Σ_T Bᵀ g)`. The surface then has a mean squared distance of
     `dᵀ G d - 2 dᵀ p + c`.
     """
 
-    rows: np.ndarray                 # (Z, C, r, P), B: derivatives of every candidate, over a marker's deviation
-    gaps: np.ndarray                 # (Z, C, r), g: how far it is from where the body has it, over the same
+    rows: np.ndarray                 # (Z, C, r, P), B: derivatives of every candidate, over `marker_sd`
+    gaps: np.ndarray                 # (Z, C, r), g: offset of the marker from its simulation, over `marker_sd`
     gram: np.ndarray                 # (Z, P, P), square metres, G
     pull: np.ndarray                 # (Z, P), square metres, p
-    rest: np.ndarray                 # (Z,), square metres, c: what the model cannot reach
+    rest: np.ndarray                 # (Z,), square metres, c: error of the fit to the whole surface
     precision: np.ndarray            # (P, P), Λ of the priors
-    lean: np.ndarray                 # (Z, P), l: where the priors pull
+    lean: np.ndarray                 # (Z, P), l: pull of the priors
 
     def steps(self, chosen: Sequence[int] | np.ndarray) -> np.ndarray:
-        """(Z, P) from these candidates, each solved for by itself. [MoSh] Eq. 26"""
+        """Solve for the steps (Z, P) of all bodies from chosen candidates. [MoSh] Eq. 26"""
         Z, _, _, P = self.rows.shape
         B = self.rows[:, chosen].reshape(Z, -1, P)
         transposed = np.swapaxes(B, -1, -2)
@@ -45,31 +45,31 @@ class LinearBodies:
         return np.asarray(np.linalg.solve(transposed @ B + self.precision, right[..., None])[..., 0])
 
     def surface_error(self, steps: np.ndarray) -> np.ndarray:
-        """(Z,) mean squared distance of the surface, square metres, after steps (Z, P)."""
+        """Compute the mean squared distance (Z,) of the surface, square metres, after steps (Z, P)."""
         return np.asarray(((steps[:, None] @ self.gram)[:, 0] * steps - 2 * self.pull * steps).sum(axis=1) + self.rest)
 
     def rmse(self, chosen: Sequence[int] | np.ndarray) -> float:
-        """Root of the mean squared distance, metres, over all vertices and bodies. [MoSh] Eq. 27"""
+        """Compute the RMSE over all vertices and bodies, metres, from chosen candidates. [MoSh] Eq. 27"""
         return float(np.sqrt(self.surface_error(self.steps(chosen)).mean()))
 
     def of(self, bodies: np.ndarray) -> LinearBodies:
-        """Some of the bodies only."""
+        """Return some of the bodies."""
         return LinearBodies(self.rows[bodies], self.gaps[bodies], self.gram[bodies], self.pull[bodies],
                             self.rest[bodies], self.precision, self.lean[bodies])
 
 
 @dataclass(frozen=True, eq=False)
 class WholeFits:
-    """Bodies, their candidates, and the model fitted to their whole surfaces."""
+    """Bodies, their candidate markers, and the model fitted to their whole surface."""
 
     x: np.ndarray                    # (Z, P) unknowns: pose, trans, betas
     markers: BodyPoints              # the candidates, on the skin
-    places: np.ndarray               # (Z, C, 3), metres: where they are on the bodies
+    places: np.ndarray               # (Z, C, 3), metres: their places on the bodies
     prior: Prior
     linear: LinearBodies
 
     def refit(self, chosen: Sequence[int] | np.ndarray, config: DesignConfig) -> np.ndarray:
-        """Unknowns (Z, P) from some candidates without linearising, from the fit to the whole body on. [MoSh] Eq. 26"""
+        """Fit unknowns (Z, P) to some candidates without linearisation, from that of the whole body. [MoSh] Eq. 26"""
         chosen = np.asarray(chosen)
         weights = np.full(len(chosen), config.marker_sd**-2)
         return fit_points(self.markers.some(chosen), self.places[:, chosen], weights, self.prior, self.x,
@@ -87,16 +87,17 @@ def fit_bodies(model: BodyModel, bodies: np.ndarray, candidates: MarkerLayout, c
         raise ValueError(f"candidates: expected markers on vertices 0..{N - 1}, got {len(candidates.labels)} markers "
                          f"up to vertex {most}")
     tell, template, sd = progress or (lambda done, total: None), model.template.vertices, config.marker_sd
-    few = spread_vertices(template, 400)  # vertices that stand for all of them in the first fit to each whole body
-    weights = share_of_vertices(template, few) * len(few) / (len(template) * sd**2)
+    # fit to the whole surface, represented by 400 spread vertices, each weighted by its share
+    sample = spread_vertices(template, 400)
+    weights = share_of_vertices(template, sample) * len(sample) / (len(template) * sd**2)
     start = rough_poses(model, bodies, n_betas)
-    x = fit_points(BodyPoints(model.points(few, None, n_betas)), bodies[:, few], weights,
+    x = fit_points(BodyPoints(model.points(sample, None, n_betas)), bodies[:, sample], weights,
                    prior_around(model, start), start, FIT_ITERATIONS, lambda done: tell(done, 2 * len(bodies)))
     ids, shares = candidates.skin
     markers, prior = BodyPoints(model.points(ids, shares, n_betas)), prior_around(model, x)
     places = np.einsum("lk,zlkd->zld", shares, bodies[:, ids])
 
-    # linearised: points of the surface (L) stand for shares (L,) of it
+    # linearise markers and surface there, in batches of bodies
     spread = spread_vertices(template, config.surface)
     surface = BodyPoints(model.points(spread, None, n_betas))
     root = np.sqrt(share_of_vertices(template, spread) / len(template))[:, None]
@@ -119,7 +120,7 @@ def fit_bodies(model: BodyModel, bodies: np.ndarray, candidates: MarkerLayout, c
 
 
 def check_marker_bodies(model: BodyModel, bodies: np.ndarray) -> np.ndarray:
-    """The bodies (Z, N, 3) as an array, or ValueError; also for a model without betas."""
+    """Return bodies (Z, N, 3) as an array; ValueError for another shape, or for a model without betas."""
     if not model.n_betas:
         raise ValueError("model: expected one with betas, this one knows its template's body only")
     bodies, wanted = np.asarray(bodies), model.template.vertices.shape
@@ -129,10 +130,10 @@ def check_marker_bodies(model: BodyModel, bodies: np.ndarray) -> np.ndarray:
 
 
 def share_betas(linear: LinearBodies, x: np.ndarray, people: np.ndarray, n_betas: int) -> LinearBodies:
-    """The same bodies, linearised around x (Z, P), with betas common to those of a person (Z,): one problem a person.
+    """Combine bodies, linearised around x (Z, P), that share the betas of a person (Z,): one problem for each person.
 
-    Unknowns of a person are pose and place of the bodies one after the other, and the betas, a step from the mean
-    of those that the bodies have by themselves. Rows of a candidate are those in all the bodies.
+    Unknowns of a person are pose and place of its bodies in turn, then the betas, as a step from the mean of those of
+    its bodies. The rows of a candidate are those in all bodies.
     """
     names, each = np.unique(people, return_counts=True)
     if len(people) != len(x) or len(set(each.tolist())) > 1:
@@ -144,7 +145,7 @@ def share_betas(linear: LinearBodies, x: np.ndarray, people: np.ndarray, n_betas
     shift = np.zeros((len(names), F, P))
     betas = x[bodies][:, own].reshape(len(names), F, K)
     shift[..., own] = betas.mean(axis=1, keepdims=True) - betas
-    # steps are counted from where the shift leads
+    # shift every body to the mean betas of its person, to first order; steps start there
     at, lead = linear.of(bodies), shift.reshape(Z, P)
     at = replace(at, gaps=at.gaps - (at.rows @ lead[:, None, :, None])[..., 0],
                  pull=at.pull - (at.gram @ lead[..., None])[..., 0], rest=at.surface_error(lead),
@@ -155,22 +156,23 @@ def share_betas(linear: LinearBodies, x: np.ndarray, people: np.ndarray, n_betas
     precision, lean = np.zeros(gram.shape[1:]), np.zeros_like(pull)
     alone = (at.rows.reshape(len(names), F, C, r, P), at.gram.reshape(len(names), F, P, P),
              at.pull.reshape(len(names), F, P), at.lean.reshape(len(names), F, P))
+    # blocks of the f-th body of every person, and its contributions to the common betas
     for f in range(F):
         B, G, p, lean_f = (a[:, f] for a in alone)
-        mine = np.r_[f * n:(f + 1) * n, F * n:F * n + K]
-        rows[:, :, f * r:(f + 1) * r, mine] = B
-        gram[:, mine[:, None], mine] += G / F
-        pull[:, mine] += p / F
-        lean[:, mine[:n]] = lean_f[:, :n]
-        precision[mine[:n, None], mine[:n]] = linear.precision[:n, :n]
+        block = np.r_[f * n:(f + 1) * n, F * n:F * n + K]
+        rows[:, :, f * r:(f + 1) * r, block] = B
+        gram[:, block[:, None], block] += G / F
+        pull[:, block] += p / F
+        lean[:, block[:n]] = lean_f[:, :n]
+        precision[block[:n, None], block[:n]] = linear.precision[:n, :n]
     precision[F * n:, F * n:] = linear.precision[own, own]
-    lean[:, F * n:] = alone[3][:, 0, own]                            # all bodies are at the same betas now
+    lean[:, F * n:] = alone[3][:, 0, own]                            # the same for all bodies, at the same betas
     return LinearBodies(rows, gaps.transpose(0, 2, 1, 3).reshape(len(names), C, F * r), gram, pull,
                         at.rest.reshape(len(names), F).mean(axis=1), precision, lean)
 
 
 def example_poses(model: BodyModel, count: int) -> np.ndarray:
-    """Poses (count, J, 3) that the model was learned from, as different as can be; the first is the most usual one."""
+    """Return poses (count, J, 3) of the training set that differ most; the first is the most usual one."""
     examples = model.pose_examples
     if not 1 <= count <= len(examples):
         raise ValueError(f"count: expected 1..{len(examples)} poses, those that the model keeps, got {count}")
@@ -181,7 +183,7 @@ def example_poses(model: BodyModel, count: int) -> np.ndarray:
 
 def in_poses(model: BodyModel, bodies: np.ndarray, poses: np.ndarray,
              progress: Progress | None = None) -> np.ndarray:
-    """Each registered body (Z, N, 3), metres, with its own full shape, in poses (F, J, 3): (Z, F, N, 3) float32."""
+    """Put registered bodies (Z, N, 3), metres, with their own shape into poses (F, J, 3): (Z, F, N, 3) float32."""
     bodies = check_marker_bodies(model, bodies)
     poses, _ = check_pose(model.skeleton, poses, None)
     fitter, tell = ShapeFitter(model, FitConfig(polish=0)), progress or (lambda done, total: None)

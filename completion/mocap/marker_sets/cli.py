@@ -1,4 +1,4 @@
-"""`scape layout`: which marker sets there are, what they look like, and on other bodies."""
+"""`scape layout`: list marker sets, show them, transfer them to other bodies."""
 from __future__ import annotations
 
 import contextlib
@@ -46,7 +46,7 @@ COMMANDS = {
 
 
 def group(argv: list[str]) -> int:
-    """The commands of `scape layout`."""
+    """Run a command of `scape layout`."""
     return dispatch(COMMANDS, "scape layout", argv, "Where on the body the markers sit.")
 
 
@@ -82,6 +82,7 @@ def show_layout(layout: LayoutArg, output: Output, model: ModelOrNone = None, bo
 
     if model is not None and body is not None:
         raise UsageError("--model and --body: expected one of them")
+    # the body, the layout on it, and its picture
     shown, skeleton, kept, name = _body(model, body, unit)
     found = read_layout(layout, shown, kept, skeleton)
     figures = _figures(found, shown)
@@ -89,8 +90,9 @@ def show_layout(layout: LayoutArg, output: Output, model: ModelOrNone = None, bo
     output.mkdir(parents=True, exist_ok=True)
     save_png(output / "layout.png", picture)
     found.save(output / "layout.json")
+    # an OpenSim marker set, where the skeleton is a person's
     if skeleton is not None:
-        with contextlib.suppress(ValueError):                       # no person's parts
+        with contextlib.suppress(ValueError):                       # a skeleton without a person's parts
             storage.write_file(output / "markerset.xml", marker_set(opensim_markers(found, shown, skeleton)))
     layout_page(layout, shown, found, picture, {m.name: f"{m.text()} {m.unit}" for m in figures}, skeleton
                 ).write(output / "report.html")
@@ -122,6 +124,7 @@ def transfer_to(layout: LayoutArg, target: Path, output: Output, source: Path | 
     from .pictures import picture_layout
     from .transfer import UNCERTAIN, transfer_layout
 
+    # source and target bodies, and the layout on the source
     ours = average_person().mesh if source is None else read_mesh(source)
     theirs = at_rest(load_model(target)) if target.suffix.lower() == ".npz" else read_mesh(target, unit)
     if source is None and layout not in layout_names():
@@ -129,10 +132,12 @@ def transfer_to(layout: LayoutArg, target: Path, output: Output, source: Path | 
                          f"{', '.join(layout_names())}")
     found = read_layout(layout, ours, None)
     pairs = None
+    # pairs of landmarks of the same name on both bodies
     if landmarks is not None:
         marks = synthetic_landmarks() if source is None and source_landmarks is None else read_template_landmarks(
             source or Path("average person"), ours, source_landmarks, "--source-landmarks")
         pairs = try_match_landmarks(landmarks, marks, read_landmarks(landmarks, theirs, unit))
+    # register and transfer, then write the layout, a picture and the registered source
     with bar("registering") as progress:
         result = transfer_layout(found, ours, theirs, pairs, progress=progress)
     result.layout.save(output)
@@ -152,7 +157,7 @@ def transfer_to(layout: LayoutArg, target: Path, output: Output, source: Path | 
 
 def _body(model: Path | None, body: Path | None, unit: Unit | None
           ) -> tuple[Mesh, Skeleton | None, np.ndarray | None, str]:
-    """The body to show, its skeleton, the vertices of the synthetic people it kept, and its name."""
+    """Return the body to show, its skeleton, the vertices that it kept of the synthetic people, and its name."""
     if body is not None:
         return read_mesh(body, unit), None, None, str(body)
     loaded, name = read_model(model)
@@ -162,7 +167,7 @@ def _body(model: Path | None, body: Path | None, unit: Unit | None
 
 
 def _figures(layout: MarkerLayout, body: Mesh) -> list[Metric]:
-    """Counts, and how near the two nearest markers are."""
+    """Return counts of markers and pairs, and the least distance of two markers."""
     from scipy.spatial import cKDTree
 
     pairs = label_pairs(layout.labels)

@@ -1,4 +1,4 @@
-"""Where on the body the markers sit."""
+"""Marker layouts: where on the body the markers sit."""
 from __future__ import annotations
 
 import re
@@ -20,11 +20,12 @@ DISTANCE = 0.0095        # metres from the skin to the centre of a common marker
 
 @dataclass(frozen=True, eq=False)
 class MarkerLayout:
-    """Markers on the skin of a body, or a little above it.
+    """Places of markers on the skin of a body, with their distances from it.
 
     Parameters
     ----------
-    labels : L strings, each different
+    labels : sequence of L strings
+        All different.
     vertices : (L,) int, or (L, 3) int
         The vertex below each marker, or three vertices whose weighted mean is the point of the skin.
     distances : (L,) float, metres, or one number
@@ -34,17 +35,25 @@ class MarkerLayout:
     aliases : {label: label}
         Other labels for the same places, where files differ.
     loose : strings
-        Labels of markers that sit anywhere on their limb, not on a point of the anatomy: `vertices` has them where
-        they usually are, `find_person` finds where they are on one person.
+        Labels of markers that may sit anywhere on their limb, not on a point of the anatomy. `vertices` has their usual
+        places; `find_person` finds those on one person.
     wands : strings
-        Labels of markers that some wear on wands: their distances are those on the skin, `find_person` finds how far
-        they stand off on one person.
+        Labels of markers that may be on wands. Their distances are those on the skin; `find_person` finds those on one
+        person.
 
     Raises
     ------
     ValueError
         Shapes that do not agree, a label that comes twice, a negative vertex, an alias of an unknown label, an
         unknown label among those that are loose or on wands.
+
+    Examples
+    --------
+    >>> layout = MarkerLayout(("LKNE", "RKNE"), [120, 340], aliases={"L_KNEE": "LKNE"})
+    >>> layout, layout.match_labels(["L_KNEE"], minimum=1)
+    (MarkerLayout(2 markers), ('L_KNEE',))
+
+    [MoSh]
     """
 
     labels: tuple[str, ...]
@@ -78,6 +87,7 @@ class MarkerLayout:
             if weights.shape != (L, 3) or not np.allclose(weights.sum(axis=1), 1, atol=1e-6):
                 raise ValueError(f"weights: expected shape ({L}, 3) with rows that sum to 1, got {weights.shape}")
             values["weights"] = weights
+        # labels in aliases, loose and wands must exist
         wrong = [alias for alias, label in self.aliases.items() if label not in labels or alias in labels]
         if wrong:
             raise ValueError(f"aliases: expected new labels for markers of the layout, got {wrong[0]!r} for "
@@ -87,6 +97,7 @@ class MarkerLayout:
             if unknown:
                 raise ValueError(f"{name}: {', '.join(unknown)} not among {', '.join(labels)}")
             values[name] = tuple(some)
+        # store the checked values in the frozen dataclass; arrays become read-only
         for name, value in values.items():
             if isinstance(value, np.ndarray):
                 value.flags.writeable = False
@@ -97,7 +108,7 @@ class MarkerLayout:
 
     @staticmethod
     def load(path: str | Path, n_vertices: int | None = None) -> MarkerLayout:
-        """Read a layout of `save`, or of the same form from elsewhere.
+        """Read a layout of `save`, or a file of the same form.
 
         The form is `{"markersets": [{"type": ..., "distance_from_skin": 0.0095, "indices": {label: vertex}}]}`;
         in place of a vertex there may be `{"vertices": [a, b, c], "weights": [u, v, w]}`, a set may be `"loose": true`
@@ -105,8 +116,10 @@ class MarkerLayout:
 
         Parameters
         ----------
+        path : str or Path
+            JSON file.
         n_vertices : int, optional
-            Of the body, to refuse a layout that was made for another one.
+            Number of vertices of the body, to refuse a layout for another one.
 
         Raises
         ------
@@ -120,6 +133,7 @@ class MarkerLayout:
             if not isinstance(sets, list):
                 raise MarkerFileError(f'{path}: expected a marker layout {{"markersets": [...]}}, '
                                       "found something else")
+            # one row for each marker: label, place, distance, and the set it belongs to
             rows = []
             for markers in sets:
                 indices = markers.get("indices") if isinstance(markers, Mapping) else None
@@ -137,6 +151,7 @@ class MarkerLayout:
             loose, wands = (tuple(label for label, of in zip(labels, owners, strict=True) if of.get(kind, False))
                             for kind in ("loose", "wand"))
             weights = None
+            # vertices and triangles in one file all become triangles
             if not all(isinstance(place, int) for place in places):
                 pairs = [([p] * 3, [1.0, 0.0, 0.0]) if isinstance(p, int) else (p["vertices"], p["weights"])
                          for p in places]
@@ -150,23 +165,24 @@ class MarkerLayout:
 
     @property
     def skin(self) -> tuple[np.ndarray, np.ndarray]:
-        """Vertices and weights (L, k) of the points of the skin below the markers, k 1 or 3."""
+        """Vertices and weights (L, k), k = 1 or 3, of the points of the skin below the markers."""
         ids = self.vertices if self.vertices.ndim == 2 else self.vertices[:, None]
         return ids, np.ones(ids.shape) if self.weights is None else self.weights
 
     @property
     def nearest(self) -> np.ndarray:
-        """(L,) the vertex that has the largest share in each marker's place."""
+        """The vertex (L,) with the largest weight for each marker."""
         ids, weights = self.skin
         return np.take_along_axis(ids, weights.argmax(axis=1)[:, None], axis=1)[:, 0]
 
     def skin_points(self, vertices: np.ndarray) -> np.ndarray:
-        """(L, 3) the points below the markers, metres, of skin with vertices (N, 3)."""
+        """Compute the points (L, 3) of the skin below the markers, metres, for vertices (N, 3)."""
         ids, weights = self.skin
         return np.einsum("lk,lkd->ld", weights, vertices[ids])
 
     def save(self, path: str | Path) -> None:
-        """Write as JSON, one marker set for each distance from the skin, whole or not at all."""
+        """Write as JSON, with one marker set for each distance from the skin; the file is whole or absent."""
+        # one set for each distance and kind; markers on triangles have three vertices and weights
         sets: dict[tuple[float, bool, bool], dict[str, Any]] = {}
         for i, (label, distance) in enumerate(zip(self.labels, np.asarray(self.distances).tolist(), strict=True)):
             place: Any = self.vertices[i].tolist()
@@ -180,10 +196,11 @@ class MarkerLayout:
         storage.write_json(path, tree | ({"aliases": dict(self.aliases)} if self.aliases else {}))
 
     def match_labels(self, labels: Sequence[str], minimum: int = 3) -> tuple[str, ...]:
-        """Those of the labels that the layout knows, in their own order, or ValueError where they are fewer.
+        """Return the labels that the layout knows, in their order; ValueError for fewer than `minimum`.
 
-        An alias counts only where its marker is not there.
+        An alias counts only where its marker is missing.
         """
+        # an alias is dropped if its marker, or an earlier alias of it, is there too
         names = [label if label in self.labels else self.aliases.get(label) for label in labels]
         found = tuple(label for i, label in enumerate(labels)
                       if names[i] is not None and (names[i] == label or names[i] not in [*labels, *names[:i]]))
@@ -193,12 +210,13 @@ class MarkerLayout:
         return found
 
     def match_columns(self, labels: Sequence[str], minimum: int = 3) -> tuple[np.ndarray, MarkerLayout]:
-        """Which columns (n,) of a sequence the layout knows, as `matched` finds them, and their part of the layout."""
+        """Return the columns (n,) of a sequence that the layout knows, by `match_labels`, and that part of it."""
         known = self.match_labels(labels, minimum)
         return np.array([list(labels).index(label) for label in known], dtype=int), self.select(known)
 
     def with_spellings(self, labels: Sequence[str]) -> MarkerLayout:
-        """The same with those labels as aliases that differ from its own only in case, dots, blanks or dashes."""
+        """Return the layout with aliases for labels that differ only in case, dots, blanks or dashes."""
+        # simplified spelling -> labels; an ambiguous spelling is not used
         meant: dict[str, set[str]] = {}
         for name in (*self.labels, *self.aliases):
             meant.setdefault(_plain(name), set()).add(self.aliases.get(name, name))
@@ -208,7 +226,7 @@ class MarkerLayout:
         return replace(self, aliases={**self.aliases, **more}) if more else self
 
     def select(self, labels: Sequence[str]) -> MarkerLayout:
-        """The markers of these labels, in this order; an alias becomes the label."""
+        """Return the markers of some labels, in that order; an alias becomes the label."""
         unknown = [label for label in labels if label not in self.labels and label not in self.aliases]
         if unknown:
             raise ValueError(f"labels: {', '.join(unknown)} not among {', '.join(self.labels)}")
@@ -219,7 +237,7 @@ class MarkerLayout:
                             None if self.weights is None else self.weights[rows], loose=loose, wands=wands)
 
     def without(self, labels: Sequence[str]) -> MarkerLayout:
-        """All markers but these; an alias takes its marker out, and aliases of markers that go, go too."""
+        """Return all other markers; an alias removes its marker, and aliases of removed markers are removed."""
         known = {**{label: label for label in self.labels}, **self.aliases}
         unknown = [label for label in labels if label not in known]
         if unknown:
@@ -229,10 +247,11 @@ class MarkerLayout:
         return replace(kept, aliases={a: label for a, label in self.aliases.items() if label not in gone})
 
     def merge(self, other: MarkerLayout) -> MarkerLayout:
-        """The markers of both, of which no label is the same; aliases that are labels now go."""
+        """Return the markers of both layouts, without common labels; aliases that become labels are dropped."""
         labels, both = (*self.labels, *other.labels), (self, other)
         aliases = {a: label for each in (other, self) for a, label in each.aliases.items() if a not in labels}
         weights = None
+        # with weights in either layout, all places become triangles
         if self.weights is None and other.weights is None:
             places = np.concatenate([self.vertices, other.vertices])
         else:
@@ -243,7 +262,7 @@ class MarkerLayout:
                             aliases, (*self.loose, *other.loose), (*self.wands, *other.wands))
 
     def with_places(self, places: Mapping[str, int]) -> MarkerLayout:
-        """The same with some markers on other vertices, {label: vertex}; an alias moves its marker."""
+        """Return the layout with some markers on other vertices, {label: vertex}; an alias moves its marker."""
         vertices, weights = self.vertices.copy(), None if self.weights is None else self.weights.copy()
         for label, vertex in places.items():
             row = self.labels.index(self.aliases.get(label, label))
@@ -253,13 +272,14 @@ class MarkerLayout:
         return replace(self, vertices=vertices, weights=weights)
 
     def place(self, mesh: Mesh) -> np.ndarray:
-        """Where the markers are on a body (L, 3), metres: the point of the skin, and out along the normal there.
+        """Compute the positions (L, 3), metres, of the markers on a body: points of the skin, moved along the normal.
 
         The normal is that of the vertex or of the triangle on which a marker sits.
         """
         self._check(len(mesh.vertices), "vertices")
         vertices, normals = mesh.vertices[self.vertices], mesh.vertex_normals[self.vertices]
         if self.weights is not None:
+            # the triangle's normal, on the side of its vertex normals; without area, that of a vertex
             corners, smooth = vertices, normals
             vertices = self.skin_points(mesh.vertices)
             normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
@@ -269,6 +289,7 @@ class MarkerLayout:
         return vertices + np.asarray(self.distances)[:, None] * normals
 
     def _check(self, n_vertices: int, what: str) -> None:
+        """Check that all markers are on vertices of a body with so many."""
         outside = [label for label, v in zip(self.labels, self.vertices, strict=True) if np.max(v) >= n_vertices]
         if outside:
             place = self.vertices[self.labels.index(outside[0])].tolist()
@@ -277,5 +298,5 @@ class MarkerLayout:
 
 
 def _plain(label: str) -> str:
-    """A label without case, dots, blanks, dashes and underscores."""
+    """Return a label without case, dots, blanks, dashes and underscores."""
     return re.sub(r"[ ._-]", "", label).upper()

@@ -1,4 +1,4 @@
-"""The layouts that come along: usual marker sets on the bodies that are known here."""
+"""Built-in layouts: common marker sets on the bodies that are known here."""
 from __future__ import annotations
 
 import hashlib
@@ -28,23 +28,35 @@ OWN = ('write a file {"markersets": [{"distance_from_skin": 0.0095, "indices": {
 
 
 def faces_digest(faces: np.ndarray) -> str:
-    """16 hexadecimal digits that tell one triangulation from another."""
+    """Compute 16 hexadecimal digits that identify a triangulation."""
     return hashlib.sha256(np.ascontiguousarray(faces, dtype="<i8").tobytes()).hexdigest()[:16]
 
 
 def layout_names() -> tuple[str, ...]:
-    """The marker sets that come along."""
+    """Return the names of the built-in marker sets.
+
+    Returns
+    -------
+    tuple of str
+
+    Examples
+    --------
+    >>> "cmu41" in layout_names()
+    True
+
+    [MoSh]
+    """
     return tuple(sorted({tree["name"] for _, tree in _files()}))
 
 
 def set_labels(name: str) -> tuple[str, ...]:
-    """The labels of a marker set that comes along."""
+    """Return the labels of a built-in marker set."""
     tree = next(tree for _, tree in _files() if tree["name"] == name)
     return tuple(label for markers in tree["markersets"] for label in markers["indices"])
 
 
 def layout_summaries() -> list[tuple[str, int, str, str]]:
-    """Name, number of markers, what it is, and the bodies it is known on, of every set that comes along."""
+    """Return name, number of markers, description and bodies of every built-in marker set."""
     out = []
     for name in layout_names():
         trees = [tree for _, tree in _files() if tree["name"] == name]
@@ -54,22 +66,35 @@ def layout_summaries() -> list[tuple[str, int, str, str]]:
 
 
 def load_layout(name: str, template: Mesh, kept: np.ndarray | None = None) -> MarkerLayout:
-    """A usual marker set on a body that is known here: the triangles of SCAPE and SPRING, or the synthetic people.
+    """Load a built-in marker set for a known body: the triangles of SCAPE and SPRING, or of the synthetic people.
 
     Parameters
     ----------
     name : str
         One of `layout_names()`, such as "cmu41".
     template : Mesh
-        Known by its triangles, whatever its shape and pose.
+        Recognised by its triangles, in any shape and pose.
     kept : (N,) int, optional
-        The vertices of the synthetic people that a template with fewer triangles kept,
-        `info["people_vertices"]` of their model.
+        The vertices of the synthetic people that a template with fewer triangles kept: `info["people_vertices"]` of
+        its model.
+
+    Returns
+    -------
+    MarkerLayout
 
     Raises
     ------
     ValueError
-        A set that does not come along, or a body on which it is not known.
+        An unknown set, or a body on which it is not known.
+
+    Examples
+    --------
+    >>> from model import load_built_in_model
+    >>> model = load_built_in_model()
+    >>> load_layout("cmu41", model.template, np.array(model.info["people_vertices"]))
+    MarkerLayout(41 markers)
+
+    [MoSh]
     """
     if name not in layout_names():
         raise ValueError(f"name: expected a marker layout of {', '.join(layout_names())}, got {name!r}; for another, "
@@ -79,6 +104,7 @@ def load_layout(name: str, template: Mesh, kept: np.ndarray | None = None) -> Ma
     for path, body in bodies:
         if (body["vertices"], body["faces"]) == (len(template.vertices), digest):
             return MarkerLayout.load(path)
+    # a decimated template of the synthetic people: the nearest places on its triangles
     if kept is not None and len(kept) == len(template.vertices):
         for path, body in bodies:
             if body["name"] == "synthetic people":
@@ -94,26 +120,27 @@ def load_layout(name: str, template: Mesh, kept: np.ndarray | None = None) -> Ma
 
 @cache
 def _files() -> tuple[tuple[Path, dict[str, Any]], ...]:
+    """Read all built-in layout files, once."""
     return tuple((path, storage.read_json(path, "a marker layout")) for path in sorted(FOLDER.glob("*.json")))
 
 
 def fitting_layout(labels: Sequence[str], template: Mesh, kept: np.ndarray | None = None
                    ) -> tuple[MarkerLayout, str]:
-    """The named layout that knows most of some labels, and its name; ValueError where none knows three of them."""
-    found = {name: load_layout(name, template, kept).with_spellings(labels) for name in layout_names()}
-    known = {name: len(layout.match_labels(labels, 0)) for name, layout in found.items()}
-    best = max(found, key=lambda name: (known[name], -len(found[name].labels)))
-    fewest = 3  # labels by which a marker set is known
+    """Find the built-in layout that knows most labels, and its name; ValueError where none knows three of them."""
+    layouts = {name: load_layout(name, template, kept).with_spellings(labels) for name in layout_names()}
+    known = {name: len(layout.match_labels(labels, 0)) for name, layout in layouts.items()}
+    best = max(layouts, key=lambda name: (known[name], -len(layouts[name].labels)))
+    fewest = 3  # least known labels
     if known[best] < fewest:
         told = ", ".join(f"{name} {count}" for name, count in sorted(known.items(), key=lambda item: -item[1]))
         raise ValueError(f"labels: expected at least {fewest} of a marker set, of these {len(labels)} the sets know "
                          f"{told}. The sets: scape layout list, scape layout show NAME; your own: --layout FILE, which "
                          f"scape pick makes of the model's template. Labels found: {', '.join(labels) or 'none'}")
-    return found[best], best
+    return layouts[best], best
 
 
 def choose_layout(model: BodyModel, given: str | Path | None, labels: Sequence[str]) -> tuple[MarkerLayout, str]:
-    """The layout that is named, or in a file, or the named one that fits some labels best; and its name."""
+    """Return the layout that is named, or in a file, or the built-in one that fits labels best; and its name."""
     kept = model.info.get("people_vertices")
     of_people = None if kept is None else np.array(kept)
     if given is None:
@@ -123,11 +150,10 @@ def choose_layout(model: BodyModel, given: str | Path | None, labels: Sequence[s
 
 def read_layout(given: str | Path, template: Mesh, kept: np.ndarray | None = None, skeleton: Skeleton | None = None
                 ) -> MarkerLayout:
-    """The layout for a body that is named, or in a file: a layout, or places that were clicked on the template.
+    """Read a layout for a body: a built-in name, a layout file, or places clicked on the template, as by `scape pick`.
 
-    With the skeleton of the template also a marker set of OpenSim (.xml), or a model with one (.osim).
-
-    Such as `scape pick` saves; MarkerFileError for places that are not on the template.
+    With the skeleton of the template, also a marker set of OpenSim (.xml) or a model with one (.osim). MarkerFileError
+    for places that are not on the template.
 
     [SCAPE] §8
     """
@@ -145,28 +171,28 @@ def read_layout(given: str | Path, template: Mesh, kept: np.ndarray | None = Non
         return MarkerLayout.load(named, len(template.vertices))
     layout, distances = layout_on(template, read_landmarks(named, template))
     far = distances.argmax()
-    if distances[far] > 0.015 * size(template):                        # a click is that much off the skin at most
+    if distances[far] > 0.015 * size(template):                        # clicks are at most 1.5% of the size off
         raise MarkerFileError(f"{named}: expected places on the model's template, '{layout.labels[far]}' is "
                               f"{1000 * distances[far]:.0f} mm off it; click them on the template")
     return layout
 
 
 def layout_on(body: Mesh, places: Mapping[str, np.ndarray]) -> tuple[MarkerLayout, np.ndarray]:
-    """Markers on the skin of a body where it is nearest to places (3,), metres, and how far (L,) it is from them.
+    """Make a layout from places (3,), metres, on a body; return it and the distances (L,) of the places from the skin.
 
-    A body in the model's triangles, completed from a scan of the person who wears the markers, thereby tells where
-    they sit on the model.
+    With a body in the model's triangles, completed from a scan of the person with markers, it gives their places on the
+    model.
 
     [SCAPE] §8
     """
     found = Surface(body).closest(np.array(list(places.values())))
-    inside = np.clip(found.bary, 0.0, 1.0)                        # without the last digits outside of the triangle
+    inside = np.clip(found.bary, 0.0, 1.0)                        # rounding errors may be outside the triangle
     weights = inside / inside.sum(axis=1, keepdims=True)
     return MarkerLayout(tuple(places), body.faces[found.faces], weights=weights), found.distances
 
 
 def layout_or_file(given: str | Path) -> str | Path:
-    """What a command line names: a layout of ours as text, or a file as Path, on whose contents results depend."""
+    """Return a name from a command line as text, or a file as Path, so that results depend on its content."""
     if str(given) in layout_names():
         return str(given)
     if not Path(given).exists():

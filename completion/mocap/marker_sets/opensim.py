@@ -1,4 +1,4 @@
-"""A layout as a marker set of OpenSim: every marker on the body that carries it, to begin with in the scale tool."""
+"""Layouts as marker sets of OpenSim: every marker on its body, as a start for the scale tool."""
 from __future__ import annotations
 
 from pathlib import Path
@@ -17,22 +17,22 @@ from ..files.text import MarkerFileError
 from .layout import MarkerLayout
 from .symmetry import label_pairs
 
-_LIMBS = {"humerus": "ulna", "ulna": "hand", "femur": "tibia", "tibia": "calcn"}      # y of each points back from these
-_WITH = {"head": "torso"}            # bodies that most models do not have
-# bodies of Rajagopal's and gait2392's models that are ours under another name, and where they begin in it, metres
+_LIMBS = {"humerus": "ulna", "ulna": "hand", "femur": "tibia", "tibia": "calcn"}      # body -> the next one below it
+_WITH = {"head": "torso"}            # bodies that most models lack -> the body that has their markers
+# other bodies of Rajagopal's and gait2392's models -> our body, and their origin in it, metres
 _SAME = {"radius": ("ulna", (-0.0067, -0.0130, 0.0261)), "talus": ("tibia", (-0.010, -0.400, 0.0)),
          "toes": ("calcn", (0.1788, -0.002, 0.0011)), "head": ("torso", (-0.020, 0.3715, 0.0))}
-# metres, of Rajagopal's model: of the limbs, and from the lowest lumbar joint up to the shoulders
+# lengths in Rajagopal's model, metres: limbs, and from the lowest lumbar joint up to the shoulders
 _LENGTHS = {"femur": 0.408, "tibia": 0.400, "humerus": 0.286, "ulna": 0.249}
 _TORSO = 0.3715
 
 
 def opensim_markers(layout: MarkerLayout, body: Mesh, skeleton: Skeleton) -> dict[str, tuple[str, np.ndarray]]:
-    """Name -> path of the body of OpenSim, and the place (3,) in its frame, metres, for `marker_set`.
+    """Return label -> path of the OpenSim body, and the place (3,) in its frame, metres, for `marker_set`.
 
-    The body stands at rest, arms anywhere; the skeleton has its joints. Frames have x ahead, y up, or along the limb to
-    its root, and z right. Hips, knees, ankles, shoulders and elbows are ours; pelvis, torso and heel begin where they
-    do in gait2392. Good enough to begin with: the scale tool moves the markers to those of a recording.
+    The body stands at rest, arms anywhere; the skeleton has its joints. Frames have x forward, y up or along the limb
+    towards the root, and z right. Hips, knees, ankles, shoulders and elbows are those of the skeleton; pelvis, torso
+    and heel have their origins as in gait2392. This is a good start: the scale tool moves markers to those measured.
 
     Raises
     ------
@@ -42,7 +42,7 @@ def opensim_markers(layout: MarkerLayout, body: Mesh, skeleton: Skeleton) -> dic
     named = names_of(skeleton, "opensim")
     frames = _frames({name: skeleton.joints[skeleton.names.index(part)] for part, name in named.items()
                       if name not in _WITH}, *stance(body))
-    # the body of OpenSim that a part belongs to: its own, or that of the first part above it which has one
+    # the OpenSim body of a part: its own, or that of the first ancestor with one
     carriers, found = list[str](), {}
     for part in skeleton.part_of_vertex(body)[layout.nearest].tolist():
         name = ""
@@ -51,6 +51,7 @@ def opensim_markers(layout: MarkerLayout, body: Mesh, skeleton: Skeleton) -> dic
             name, part = _WITH.get(name, name), int(skeleton.parents[part])
         carriers.append(name if name in frames else "torso")
     order = ("pelvis", "torso", "femur", "humerus", "tibia", "ulna", "calcn", "hand")
+    # left and right markers go on the same kind of body
     for i, (label, place, other) in enumerate(zip(layout.labels, layout.place(body), label_pairs(layout.labels),
                                                   strict=True)):
         kind, _, side = carriers[i].partition("_")
@@ -63,17 +64,18 @@ def opensim_markers(layout: MarkerLayout, body: Mesh, skeleton: Skeleton) -> dic
 
 
 def opensim_places(path: Path, body: Mesh, skeleton: Skeleton) -> dict[str, np.ndarray]:
-    """Name -> place (3,), metres, of the markers of a marker set or model of OpenSim (.xml, .osim) on a body at rest.
+    """Read a marker set or model of OpenSim (.xml, .osim); return label -> place (3,), metres, on a body at rest.
 
-    As near as the frames are known: limbs are as long as ours, the trunk as high. What is left, some centimetres,
-    `find_person` finds.
+    Limbs and trunk are scaled to those of the body. Errors of some centimetres remain, which `find_person` corrects.
 
     Parameters
     ----------
     path : Path
         With markers on bodies of gait2392 or Rajagopal's model, such as `/bodyset/femur_r`.
     body : Mesh
+        At rest.
     skeleton : Skeleton
+        With joints on that body.
 
     Raises
     ------
@@ -99,7 +101,7 @@ def opensim_places(path: Path, body: Mesh, skeleton: Skeleton) -> dict[str, np.n
         if carrier not in frames:
             raise MarkerFileError(f"{path}: marker '{name}': expected one on {', '.join(sorted(frames))}, found it on "
                                   f"'{frame}'")
-        # z is right in all bodies of OpenSim
+        # origins of bodies with another name; z points right, so it changes sign on the left side
         place = scale * (place + begin * np.array([1.0, 1.0, -1.0 if side == "l" else 1.0]))
         below = f"{_LIMBS.get(kind)}_{side}"
         if kind in _LENGTHS and below in joints:
@@ -114,14 +116,14 @@ def opensim_places(path: Path, body: Mesh, skeleton: Skeleton) -> dict[str, np.n
 
 def _frames(joints: dict[str, np.ndarray], vertical: np.ndarray, ahead: np.ndarray
             ) -> dict[str, tuple[np.ndarray, np.ndarray]]:
-    """Origin (3,), metres, and axes (3, 3) as columns of every body."""
+    """Compute origin (3,), metres, and axes (3, 3) as columns, of every OpenSim body."""
     if not {"femur_l", "femur_r", "pelvis"} <= joints.keys():
         raise ValueError(f"skeleton: expected a pelvis and two thighs, as OpenSim's bodies, got {', '.join(joints)}")
-    # bodies of OpenSim's models begin at the joints, but for pelvis, torso and heel: places by the axes x ahead, y up,
-    # z right and for hips that are 0.167 m apart, as in its model gait2392
+    # OpenSim bodies have their origin at the joint, except pelvis, torso and heel. Their offsets are those of gait2392,
+    # whose hips are 0.167 m apart, in axes x forward, y up, z right.
     scale = float(np.linalg.norm(joints["femur_l"] - joints["femur_r"])) / 0.167
     upright = np.column_stack([ahead, vertical, np.cross(ahead, vertical)])
-    # between the front spines, from the middle of the hips; the lowest lumbar joint from there
+    # pelvis: between the anterior superior iliac spines, from the middle of the hips; torso: lowest lumbar joint
     pelvis = (joints["femur_l"] + joints["femur_r"]) / 2 + scale * upright @ (0.0707, 0.0661, 0.0)
     found = {"pelvis": (pelvis, upright), "torso": (pelvis + scale * upright @ (-0.1007, 0.0815, 0.0), upright)}
     for name, joint in joints.items():
@@ -136,7 +138,7 @@ def _frames(joints: dict[str, np.ndarray], vertical: np.ndarray, ahead: np.ndarr
 
 
 def _along(y: np.ndarray, vertical: np.ndarray, ahead: np.ndarray) -> np.ndarray:
-    """(3, 3) axes with this y, and x as near to ahead as it allows."""
+    """Build axes (3, 3) with a given y, and x as far forward as y allows."""
     y = y / np.linalg.norm(y)
     x = ahead if abs(y @ ahead) < 0.9 else vertical
     x = x - (x @ y) * y

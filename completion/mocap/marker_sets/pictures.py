@@ -1,4 +1,4 @@
-"""What a marker layout looks like on a body."""
+"""Pictures and report page of a marker layout on a body."""
 from __future__ import annotations
 
 from collections.abc import Mapping
@@ -17,14 +17,14 @@ from scanprep.skeleton.tree import Skeleton
 from .layout import MarkerLayout
 from .symmetry import label_pairs
 
-HEIGHT = 1000
+HEIGHT = 1000                        # pixels, so that labels are legible
 FIXED, LOOSE = (0.86, 0.24, 0.20), (0.93, 0.62, 0.12)
 
 
 def picture_layout(body: Mesh, layout: MarkerLayout, height: int | None = None) -> np.ndarray:
-    """A body from four sides with its markers, each named where it is in sight; loose ones in another colour.
+    """Render a body with its markers from four sides as (H, W, 3) uint8; visible markers have their label.
 
-    Returns (H, W, 3) uint8.
+    Loose markers have another colour.
     """
     from PIL import Image, ImageDraw
 
@@ -35,11 +35,12 @@ def picture_layout(body: Mesh, layout: MarkerLayout, height: int | None = None) 
     for camera in cameras:
         image = Image.fromarray(render([Solid(body), Dots(points, colors, radius)], camera, width, height))
         draw, taken = ImageDraw.Draw(image), list[tuple[float, float, float, float]]()
+        # markers behind the body get no label
         towards = camera.position - points
         towards /= np.linalg.norm(towards, axis=1, keepdims=True)
         hidden = Rays(body).test_occlusion(points + 1e-4 * towards, towards)
         places = camera.project(points, width, height)
-        # each label beside its marker, where no other label is
+        # a label beside each marker, at the first of six places without another label
         for i in np.argsort(places[:, 1]):
             if hidden[i]:
                 continue
@@ -57,7 +58,7 @@ def picture_layout(body: Mesh, layout: MarkerLayout, height: int | None = None) 
 
 
 def layout_rows(body: Mesh, layout: MarkerLayout, skeleton: Skeleton | None = None) -> list[tuple[str, ...]]:
-    """For every marker its label, other labels, part of the body, partner, distance from the skin and kind."""
+    """Return for every marker: label, other labels, part of the body, partner, distance from the skin, and kind."""
     pairs = label_pairs(layout.labels)
     parts = None if skeleton is None else skeleton.part_of_vertex(body)
     others: dict[str, list[str]] = {}
@@ -74,7 +75,7 @@ def layout_rows(body: Mesh, layout: MarkerLayout, skeleton: Skeleton | None = No
 
 
 def layout_pane(body: Mesh, layout: MarkerLayout) -> Pane:
-    """A body with its markers, fixed and loose ones apart."""
+    """Return a body with its markers, fixed and loose ones as separate objects."""
     points, loose = layout.place(body), np.isin(layout.labels, layout.loose)
     radius = 0.0055 * float(np.ptp(body.vertices, axis=0).max())
     dots = [Dots(points[which], color, radius, name=name, labels=np.array(layout.labels)[which].tolist())
@@ -84,7 +85,7 @@ def layout_pane(body: Mesh, layout: MarkerLayout) -> Pane:
 
 def layout_page(name: str, body: Mesh, layout: MarkerLayout, picture: np.ndarray, figures: Mapping[str, str],
                 skeleton: Skeleton | None = None) -> Page:
-    """The page of `scape layout show`; a picture stands for the body until it turns."""
+    """Make the page of `scape layout show`; the picture is shown until the body is loaded."""
     page = Page(f"Markers: {name}", "Red markers sit on a point of the anatomy, yellow ones anywhere on their limb.")
     page.bodies([layout_pane(body, layout)], "", 640, webp_bytes(picture))
     page.table(list(figures.items()), ("", ""))

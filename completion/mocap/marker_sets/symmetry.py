@@ -1,4 +1,4 @@
-"""Left and right: which marker and which place of the skin is the mirror image of which."""
+"""Left-right symmetry: mirror partners of markers and of places on the skin."""
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
@@ -17,22 +17,22 @@ from .layout import MarkerLayout
 
 @dataclass(frozen=True, eq=False)
 class SkinMirror:
-    """Where the mirror image of every vertex lies on the skin.
+    """The mirror image of every vertex, as a point of the skin.
 
     Attributes
     ----------
     faces : (N,) int
-        The triangle it lies on.
+        Triangle of the image.
     bary : (N, 3) float
-        Where on it.
+        Barycentric coordinates of the image.
     partner : (N,) int
-        The vertex nearest to it; for most, but not all, of an odd triangulation the partner's partner is the vertex
-        itself.
+        Vertex nearest to the image. In an irregular triangulation the partner's partner is the vertex itself for most
+        vertices, but not all.
     across : (N,) float, metres
-        How far each vertex is from its image, 0 in the middle, negative on one side; on which, only landmarks tell:
-        with them it is positive on the left.
+        Distance of each vertex from its image, 0 in the middle, negative on one side. With landmarks it is positive on
+        the left; without them the side is unknown.
     returns : float, metres
-        How far from where it was a vertex comes to lie that is mirrored twice, the mean.
+        Mean distance of a vertex from its place after two reflections.
     """
 
     faces: np.ndarray
@@ -42,21 +42,21 @@ class SkinMirror:
     returns: float
 
     def image(self, mesh: Mesh) -> np.ndarray:
-        """(N, 3) the mirror images of all vertices on the skin of a body of these triangles, in any pose, metres."""
+        """Compute the mirror images (N, 3) of all vertices, metres, on a body with these triangles in any pose."""
         return np.einsum("nc,ncd->nd", self.bary, mesh.vertices[mesh.faces[self.faces]])
 
 
 def label_pairs(labels: Sequence[str]) -> np.ndarray:
-    """(L,) the place of each label's partner: its own for a label that names no side, -1 where it is missing."""
+    """Return the index (L,) of each label's partner: its own for a label without side, -1 for a missing partner."""
     rows = {label: i for i, label in enumerate(labels)}
     others = [other_side(label) for label in labels]
     return np.array([i if other is None else rows.get(other, -1) for i, other in enumerate(others)], dtype=np.int64)
 
 
 def marker_pairs(layout: MarkerLayout, template: Mesh, mirror: SkinMirror | None = None) -> np.ndarray:
-    """(L,) the marker on the other side of every marker, by label, or by place where labels do not tell.
+    """Return the marker (L,) on the other side of every marker, by label, or by place where labels have no side.
 
-    Its own number for a marker in the middle, -1 where there is no partner; the partner's partner is the marker.
+    It is the marker itself in the middle, and -1 without a partner; the partner's partner is the marker.
     """
     pairs, untold = label_pairs(layout.labels), np.flatnonzero([other_side(label) is None for label in layout.labels])
     pairs[untold] = -1
@@ -75,24 +75,24 @@ def marker_pairs(layout: MarkerLayout, template: Mesh, mirror: SkinMirror | None
 
 
 def mirror_points(layout: MarkerLayout, mesh: Mesh, mirror: SkinMirror) -> np.ndarray:
-    """(L, 3) where the mirror images of the markers lie on the skin, metres."""
+    """Compute the mirror images (L, 3), metres, of the markers on the skin."""
     return layout.skin_points(mirror.image(mesh))
 
 
 def find_skin_mirror(template: Mesh, poses: np.ndarray | None = None, landmarks: Mapping[str, int] | None = None
                      ) -> SkinMirror:
-    """Where the mirror image of every vertex lies, whatever the triangulation.
+    """Find the mirror image of every vertex, for any triangulation.
 
-    The mirror image of the template is bent onto the template. Nothing is taken from the numbers of vertices.
+    The reflected template is registered to the template, without using vertex numbers.
 
     Parameters
     ----------
     template : Mesh
-        Standing nearly symmetrically, or with landmarks.
+        In a nearly symmetric pose, or with landmarks.
     poses : (M, N, 3) float, metres, optional
-        The most symmetric of them serves if the template does not stand symmetrically.
+        The most symmetric one is used if the template is not in a symmetric pose.
     landmarks : {name: vertex}, optional
-        Names that tell the sides, such as "left elbow" or "LELB"; they place the mirror image, in any pose.
+        With names that have sides, such as "left elbow" or "LELB". They align the mirror image, in any pose.
 
     Raises
     ------
@@ -109,6 +109,7 @@ def find_skin_mirror(template: Mesh, poses: np.ndarray | None = None, landmarks:
         body, image, normal = template, symmetry.image, symmetry.normal
         if symmetry.pose >= 0 and poses is not None:
             body = template.with_vertices(poses[symmetry.pose])
+    # the nearest points to the image, and where a second reflection leads
     found = Surface(body).closest(image)
     again = np.einsum("nc,ncd->nd", found.bary, found.points[body.faces[found.faces]])
     partner = cKDTree(body.vertices).query(found.points)[1]
@@ -117,7 +118,7 @@ def find_skin_mirror(template: Mesh, poses: np.ndarray | None = None, landmarks:
 
 
 def _by_landmarks(template: Mesh, landmarks: Mapping[str, int]) -> tuple[np.ndarray, np.ndarray]:
-    """The images (N, 3) of the vertices, from landmarks on both sides, and the normal of the plane, to the left."""
+    """Register the mirror image by landmarks; return images (N, 3) and the plane's normal, to the left."""
     from scanprep.registration.nonrigid import register
 
     pairs = [(v, landmarks[other]) for name, v in landmarks.items()
@@ -125,6 +126,7 @@ def _by_landmarks(template: Mesh, landmarks: Mapping[str, int]) -> tuple[np.ndar
     if len(pairs) < 3:
         raise ValueError(f"landmarks: expected at least 3 pairs of left and right, found {len(pairs)} among "
                          f"{', '.join(landmarks) or 'none'}")
+    # the plane between landmarks and their partners, then non-rigid registration
     middle = [v for name, v in landmarks.items() if side_of(name) == 0]
     left, right = np.array(pairs).T
     x, y = template.vertices[np.r_[left, right, middle]], template.vertices[np.r_[right, left, middle]]

@@ -1,4 +1,4 @@
-"""A marker layout on another triangulation, by registration."""
+"""Transfer a marker layout to another triangulation, by registration."""
 from __future__ import annotations
 
 from collections.abc import Callable
@@ -14,13 +14,13 @@ from scanprep.registration.schedule import RegistrationConfig
 from .layout import MarkerLayout
 from .named import layout_on
 
-UNCERTAIN = 0.05                      # a limb may be wrong
+UNCERTAIN = 0.05                      # share of the target not covered by the source above which a limb may be wrong
 Landmarks = tuple[np.ndarray, np.ndarray]
 
 
 @dataclass(frozen=True, eq=False)
 class TransferredLayout:
-    """A layout on another body, and how well the registration that brought it there went.
+    """A layout on another body, and the quality of the registration.
 
     Attributes
     ----------
@@ -29,14 +29,14 @@ class TransferredLayout:
     distances : (L,) float, metres
         From the registered source to the target, at each marker: across the skin, not along it.
     confidence : (L,) float in [0, 1]
-        Of the registration at each marker.
+        Confidence of the registration at each marker.
     rms : float, metres
-        Of the distances of the registered source from the target.
+        RMS distance of the registered source from the target.
     landmark_rms : float, metres
-        NaN without landmarks.
+        RMS distance of the landmarks, NaN without them.
     uncovered : float
-        Share of the target that the source does not cover: more than a few per cent says that a limb is wrong, or that
-        the bodies differ, a fist and an open hand.
+        Share of the target that the source does not cover. More than a few per cent mean a wrong limb, or different
+        bodies, such as a fist and an open hand.
     registered : Mesh
         The source's triangles on the target.
     """
@@ -53,10 +53,10 @@ class TransferredLayout:
 def transfer_layout(layout: MarkerLayout, source: Mesh, target: Mesh, landmarks: Landmarks | None = None,
                     config: RegistrationConfig | None = None, progress: Callable[[int, int], None] | None = None, *,
                     search: bool = True) -> TransferredLayout:
-    """Bring a layout onto another body: the source is registered to the target, and takes its markers along.
+    """Transfer a layout to another body: the source is registered to the target and carries its markers.
 
-    On a target of the same triangles, in whatever pose and shape, markers stay on their vertices. Labels, distances
-    from the skin, aliases and loose markers are as they were.
+    On a target with the same triangles, in any pose and shape, markers stay on their vertices. Labels, distances from
+    the skin, aliases and loose markers do not change.
 
     Parameters
     ----------
@@ -65,21 +65,37 @@ def transfer_layout(layout: MarkerLayout, source: Mesh, target: Mesh, landmarks:
     source, target : Mesh
         One connected manifold component each.
     landmarks : (K,) int and (K, 3) float, metres, optional
-        Vertices of the source and where they are on the target. Without them, places that look alike are sought, which
-        cannot tell how far a smooth limb is rotated about itself.
+        Vertices of the source and their places on the target. Without them, correspondences are found by shape, which
+        cannot tell how far a smooth limb is rotated about its axis.
     config : RegistrationConfig, optional
+        Settings of the registration.
     progress : callable, optional
-        Called as progress(done, total).
+        Called with (done, total).
     search : bool
-        Look for such places; bodies that stand alike in the same place need none.
+        Find correspondences; bodies in the same pose and place do not need them.
+
+    Returns
+    -------
+    TransferredLayout
+        The layout on the target, with distances (L,) in metres and confidence (L,).
 
     Raises
     ------
     ValueError
-        A layout of another body than the source, a target on which the source was not found, or what `register`
-        raises.
+        A layout of another body than the source, a target on which the source was not found, or an error of
+        `register`.
+
+    Examples
+    --------
+    >>> from scanprep.synthetic.topology import load_topology
+    >>> body = load_topology().mesh
+    >>> moved = body.with_vertices(body.vertices + 0.3)
+    >>> transfer_layout(MarkerLayout(("LKNE", "RKNE"), np.array([120, 340])), body, moved).layout
+    MarkerLayout(2 markers)
+
+    [Allen]
     """
-    layout.place(source)                                              # refuses a layout of another body
+    layout.place(source)                                              # ValueError for a layout of another body
     if np.array_equal(source.faces, target.faces):
         L = len(layout.labels)
         return TransferredLayout(layout, np.zeros(L), np.ones(L), 0.0, np.nan, 0.0, target)
@@ -87,15 +103,16 @@ def transfer_layout(layout: MarkerLayout, source: Mesh, target: Mesh, landmarks:
     if landmarks is not None or not search:
         fit = register(source, target, landmarks, config, tell)
     else:
-        # by places that look alike; where they leave much of the target, as both stand
+        # by correspondences; where much of the target stays uncovered, also from the present poses
         fit = register(source, target, None, config, tell, find_correspondences(source, target))
         if fit.uncovered > UNCERTAIN:
             fit = min(fit, register(source, target, None, config, tell), key=lambda one: one.uncovered)
-    if fit.uncovered > 0.3:  # of the target that the source does not cover: it is somewhere else
+    if fit.uncovered > 0.3:  # so much of the target is uncovered only if the registration failed
         raise ValueError(f"target: the source could not be brought onto it, {fit.uncovered:.0%} of it stays uncovered; "
                          "give landmarks, three at least, spread over the body")
+    # the carried points on the nearest triangles of the target
     places = dict(zip(layout.labels, layout.skin_points(fit.mesh.vertices), strict=True))
-    found, distances = layout_on(target, places)
-    there = replace(layout, vertices=found.vertices, weights=found.weights)
-    return TransferredLayout(there, distances, fit.confidence[layout.nearest], fit.rms, fit.landmark_rms,
+    nearest, distances = layout_on(target, places)
+    transferred = replace(layout, vertices=nearest.vertices, weights=nearest.weights)
+    return TransferredLayout(transferred, distances, fit.confidence[layout.nearest], fit.rms, fit.landmark_rms,
                              fit.uncovered, fit.mesh)

@@ -105,6 +105,7 @@ class FoundPerson:
     @cached_property
     def off(self) -> dict[str, float]:
         """Label -> mean distance from the simulated marker, metres; NaN for one that was not used."""
+        # residuals of each label, over all recordings
         columns: dict[str, list[np.ndarray]] = {}
         for motion in self.motions:
             for label, column in zip(motion.labels, motion.residuals.T, strict=True):
@@ -121,6 +122,7 @@ class FoundPerson:
     def doubts(self) -> dict[str, list[str]]:
         """Label -> sentences about what was wrong with it."""
         doubts: dict[str, list[str]] = {}
+        # what was found of the person: misplaced markers, exchanged names, markers left out
         for label, moved in self.about["misplaced"].items():
             before, left = (1000 * moved[name] for name in ("from_the_layout", "left"))
             doubts.setdefault(label, []).append(f"worn {before:.0f} mm from where the layout has it; moved there, "
@@ -130,6 +132,7 @@ class FoundPerson:
                 doubts.setdefault(label, []).append(f"bears the name of {other} throughout; put back")
         for label in self.about["left_out"]:
             doubts.setdefault(label, []).append("not worn where the layout has it, and found nowhere: left out")
+        # what was found of each recording: distrusted markers and artefacts
         for one, motion in zip(self.recordings, self.motions, strict=True):
             for label in motion.distrusted:
                 doubts.setdefault(label, []).append(f"{one.name}: hardly believed")
@@ -168,6 +171,7 @@ class FoundPerson:
         for first, second in self.about["exchanged"]:
             if first in measured and second in measured:
                 measured[first], measured[second] = measured[second], measured[first]
+        # simulated and measured places of each marker, and a rod between them
         has = {label: place for label, place in zip(self.layout.labels, self.layout.place(body), strict=True)
                if label in measured}
         seen, there = np.array([measured[label] for label in has]), np.array(list(has.values()))
@@ -187,9 +191,10 @@ def load_people(folder: Path, actors: Sequence[Actor], models: Models, unit: str
         own = folder / actor.name
         about = storage.read_json(own / "subject.json", "a person that scape mosh found")
         with storage.taking_apart(own / "subject.json", "a person that scape mosh found"):
+            # the model of the person's sex, and the keys of subject.json that are needed
             model = models.sexes.get((about["sex"] or {}).get("sex", ""), models.neutral)
-            if "worn_elsewhere" in about:      # the key of "misplaced" in files of earlier versions
-                about["misplaced"] = about["worn_elsewhere"]
+            # files of earlier versions have "worn_elsewhere" for "misplaced"
+            about |= {"misplaced": about["worn_elsewhere"]} if "worn_elsewhere" in about else {}
             about = {name: about[name] for name in ("betas", "layout", "misplaced", "exchanged", "left_out")}
         layout = MarkerLayout.load(own / "layout.json", len(model.template.vertices))
         readable = tuple(one for one in actor.recordings if (own / one.name / "motion.npz").exists())

@@ -55,6 +55,7 @@ def person_pane(body: Mesh, found: np.ndarray, usual: np.ndarray, labels: Sequen
 
 def kinds_of_markers(take: Take) -> dict[str, tuple[Sequence[float], np.ndarray]]:
     """Return kind -> colour and positions (T, L, 3) of the measured markers of that kind, NaN elsewhere."""
+    # used markers are those with residuals; held-out ones are not used
     held = np.isin(take.markers.labels, () if take.held is None else take.held.labels)
     used = np.isfinite(take.motion.residuals).any(axis=0) & ~held
     kinds = {"believed markers": (MARKER, take.motion.trusted & used),
@@ -132,6 +133,7 @@ def most_changed(take: Take, frames: np.ndarray, count: int) -> np.ndarray:
 
 def change_of_place(body: Mesh, layout: MarkerLayout, found: MarkerLayout) -> tuple[np.ndarray, np.ndarray]:
     """Compute places (L, 3), metres, of markers on a body, and the way from usual places: up, forward, left (L, 3)."""
+    # axes of the body: up, forward, left
     vertical, ahead = stance(body)
     axes = np.stack([vertical, ahead, np.cross(vertical, ahead)])
     places = found.place(body)
@@ -149,6 +151,7 @@ def _average_stretches(values: np.ndarray, most: int = 900) -> np.ndarray:
 
 def chart_frames(take: Take) -> Any:
     """Plot the mean distance of the markers over time: fixed shape, soft tissue, held-out markers."""
+    # one line each, averaged to a readable number of points
     figure, axes = chart(7.8, 2.7)
     lines = [("fixed shape", take.motion.residuals, "#7a8794")]
     if take.soft is not None:
@@ -167,6 +170,7 @@ def chart_frames(take: Take) -> Any:
 
 def chart_map(take: Take) -> Any:
     """Plot the distance of every marker over time, the worst marker first; white where it was not seen."""
+    # used markers only, the worst first
     off = take.shown.residuals
     used = np.flatnonzero(np.isfinite(off).any(axis=0))
     used = used[np.argsort(-mean_over(off[:, used], 0))]

@@ -80,9 +80,13 @@ def find_coverage(subject: Subject, layout: MarkerLayout, motions: Sequence[Moti
     Parameters
     ----------
     subject : Subject
+        The body.
     layout : MarkerLayout
         Where on the body the markers sit.
-    motions, markers : as many Motions and MarkerSequences
+    motions : sequence of Motion
+        One for each recording.
+    markers : sequence of MarkerSequence
+        The recordings.
     """
     skeleton, body = subject.skeleton, subject.template
     used = {label for motion in motions for label, column in zip(motion.labels, motion.residuals.T, strict=True)

@@ -23,7 +23,7 @@ def markers_told(motions: Sequence[Motion]) -> Metric:
     return Metric("markers in the mean distance", f"{len(seen) - len(out)} of {len(seen)}{without}")
 
 
-def distrusted_marker_warnings(motions: Sequence[Motion]) -> tuple[str, ...]:
+def find_distrusted_markers(motions: Sequence[Motion]) -> tuple[str, ...]:
     """Return a doubt for markers that are distrusted throughout the motions of one body."""
     out = sorted({label for motion in motions for label in motion.distrusted})
     return (f"{', '.join(out)} hardly ever believed: not worn where the layout says, and not in the mean distance",
@@ -54,7 +54,7 @@ def mean_off(motions: Sequence[Motion]) -> float:
 
 def motion_doubts(motions: Sequence[Motion], markers: Sequence[MarkerSequence], body: Mesh) -> tuple[str, ...]:
     """Return reasons to look at motions of one body from markers; `body` is the model's template."""
-    reasons = [*hardly_seen(motions), *distrusted_marker_warnings(motions)]
+    reasons = [*hardly_seen(motions), *find_distrusted_markers(motions)]
     off = mean_off(motions)
     # 0.018 of the size, 25 mm on a man: good motions are 4 to 25 mm off, shuffled frames 31
     if off > 0.018 * size(body):

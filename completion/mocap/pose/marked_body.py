@@ -296,7 +296,11 @@ def supports(template: Mesh, layout: MarkerLayout) -> tuple[np.ndarray, np.ndarr
     rows: list[tuple[np.ndarray, np.ndarray]] = []
     for corners, share in zip(base, weights, strict=True):
         if len(set(corners.tolist())) == 3:
-            rows += [(corners, share + side) for side in _sides(template, corners)]
+            # offsets along two edges, which turn about the outward normal in whatever order the corners are given
+            p = template.vertices[corners]
+            outward = np.cross(p[1] - p[0], p[2] - p[0]) @ template.vertex_normals[corners].sum(axis=0) >= 0
+            sides = np.array([[0, 0, 0], [-1, 1, 0], [-1, 0, 1]])[[0, 1, 2] if outward else [0, 2, 1]]
+            rows += [(corners, share + side) for side in sides]
             continue
         # on a vertex: the neighbours pull by the direction in which they lie
         centre = int(corners[np.argmax(share)])
@@ -323,14 +327,3 @@ def pad_combinations(rows: list[tuple[np.ndarray, np.ndarray]]) -> tuple[np.ndar
     width = max(len(ids) for ids, _ in rows)
     return (np.array([np.pad(ids, (0, width - len(ids)), mode="edge") for ids, _ in rows]),
             np.array([np.pad(weights, (0, width - len(weights))) for _, weights in rows]))
-
-
-def _sides(template: Mesh, corners: np.ndarray) -> np.ndarray:
-    """Return the offsets (3, 3) from a marker to its three supports, as weights of the corners (3,) of its triangle.
-
-    The supports turn about the outward normal, in whatever order the corners are given.
-    """
-    p = template.vertices[corners]
-    outward = np.cross(p[1] - p[0], p[2] - p[0]) @ template.vertex_normals[corners].sum(axis=0) >= 0
-    sides = np.array([[0, 0, 0], [-1, 1, 0], [-1, 0, 1]])
-    return sides if outward else sides[[0, 2, 1]]

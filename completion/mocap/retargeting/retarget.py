@@ -78,10 +78,13 @@ def morph_vertices(model: BodyModel, motion: Motion, betas: np.ndarray | Mapping
     Parameters
     ----------
     model : BodyModel
+        With betas.
     motion : Motion
+        Of a person of this model.
     betas : (T, k) float, or {seconds: (k,) float}
         For every frame, or at some times, with linear interpolation.
     frames : indices or slice, optional
+        Frames to compute, all by default.
     grounded : bool
         Move each frame vertically so that its lowest point is as high as that of the motion's own body.
 

@@ -82,7 +82,11 @@ def deformation(faces: np.ndarray, fixed: np.ndarray, changed: np.ndarray) -> np
     Parameters
     ----------
     faces : (F, 3) int
-    fixed, changed : (..., N, 3) float, metres
+        Triangles.
+    fixed : (..., N, 3) float, metres
+        Vertices without soft tissue.
+    changed : (..., N, 3) float, metres
+        Vertices with soft tissue.
 
     Returns
     -------

@@ -61,20 +61,14 @@ def latent_markers(mesh: Mesh, points: np.ndarray, kind: Attachment = "triangle"
     # the nearest corner of each triangle, and the supports from its ring
     distance = np.linalg.norm(mesh.vertices[corners] - points[:, None], axis=2)
     nearest = np.take_along_axis(corners, distance.argmin(axis=1)[:, None], axis=1)[:, 0]
-    rows = [row for centre in nearest for row in _ring_supports(mesh, int(centre))]
+    # the vertex, and two sums of its edges, of least norm, that are unit vectors of its plane [MoSh] Eq. 2, Eq. 3
+    rows = []
+    for centre in nearest.tolist():
+        ring, plane = ring_around(mesh, centre)
+        shares = np.linalg.pinv(plane).T                                                             # (n, 2)
+        ids = np.concatenate([[centre], ring])
+        rows += [(ids[:1], np.ones(1)), *((ids, np.concatenate([[1 - share.sum()], share])) for share in shares.T)]
     return LatentMarkers(kind, *pad_combinations(rows), corners)
-
-
-def _ring_supports(mesh: Mesh, centre: int) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Return a vertex and the two sums of its edges, of least norm, that are unit vectors of its tangent plane.
-
-    [MoSh] Eq. 2, Eq. 3
-    """
-    ring, plane = ring_around(mesh, centre)
-    shares = np.linalg.pinv(plane).T                                                                 # (n, 2)
-    ids = np.concatenate([[centre], ring])
-    rows = [(ids[:1], np.ones(1))]
-    return rows + [(ids, np.concatenate([[1 - share.sum()], share])) for share in shares.T]
 
 
 def _frames(kind: Attachment, supports: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

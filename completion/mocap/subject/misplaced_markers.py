@@ -207,7 +207,9 @@ def find_misplaced_markers(model: BodyModel, sequences: Sequence[MarkerSequence]
     Parameters
     ----------
     model : BodyModel
-    sequences : MarkerSequences of one subject
+        With betas.
+    sequences : sequence of MarkerSequence
+        Of one subject.
     layout : MarkerLayout
         Where markers usually sit.
     person : PersonFit

@@ -220,7 +220,7 @@ def texel_areas(control: ControlModel, texels: Texels) -> np.ndarray:
 
 
 def bend_over_folds(lattice: Lattice, scan: ReadyScan, found: Heights, reach: float) -> tuple[np.ndarray, np.ndarray]:
-    """Bend the surface over folds onto the scan: which fine vertices (n,) moved, and displacements (n, 3) of all, metres.
+    """Bend the surface over folds onto the scan: which fine vertices (n,) moved, and displacements (n, 3), metres.
 
     Each vertex is attracted to the closest scan point with a compatible normal, and held by a thin-plate energy. That
     is solved by implicit steps and made softer from step to step. Around folds the surface stays where the heights say.

@@ -1,6 +1,7 @@
-"""Control meshes split at their edges: everywhere alike, or where the surface asks for it; without a crack [Statues].
+"""Subdivision of control meshes: uniform, or adaptive where the surface is curved; always without cracks [Statues].
 
-A new vertex lies in the middle of an edge: a place on a control triangle, shared by all around it, across seams too.
+A new vertex lies in the middle of an edge. It is a place on a control triangle, shared by all triangles around it, also
+across seams of the chart.
 """
 from __future__ import annotations
 
@@ -13,16 +14,16 @@ from scanprep.geometry.mesh import Mesh
 
 from ..control.chart import Chart
 
-# Places of a triangle by number: corners 0, 1, 2 and the middles 3 of 01, 4 of 12, 5 of 20. For each set of split
-# sides (bits 1, 2, 4) the triangles that take its place; with two split sides there is a diagonal to choose.
+# Points of a triangle by number: corners 0, 1, 2 and midpoints 3 of 01, 4 of 12, 5 of 20. For each set of split sides
+# (bits 1, 2, 4) the new triangles; with two split sides the other diagonal has 8 added.
 _PATTERNS = {
     0: [(0, 1, 2)], 1: [(0, 3, 2), (3, 1, 2)], 2: [(0, 1, 4), (0, 4, 2)], 4: [(0, 1, 5), (5, 1, 2)],
     3: [(3, 1, 4), (0, 3, 4), (0, 4, 2)], 6: [(4, 2, 5), (1, 4, 5), (1, 5, 0)], 5: [(5, 0, 3), (2, 5, 3), (2, 3, 1)],
     7: [(0, 3, 5), (3, 1, 4), (5, 4, 2), (3, 4, 5)],
     8 + 3: [(3, 1, 4), (0, 3, 2), (3, 4, 2)], 8 + 6: [(4, 2, 5), (1, 4, 0), (4, 5, 0)],
     8 + 5: [(5, 0, 3), (2, 5, 1), (5, 3, 1)]}
-PROBES = np.arange(1, 8) / 8                                # places along an edge where its displacement is looked at
-INNER = np.array([(2, 2, 2), (4, 1, 1), (1, 4, 1), (1, 1, 4)]) / 6      # and in a triangle
+PROBES = np.arange(1, 8) / 8         # points along an edge where the surface is compared with it
+INNER = np.array([(2, 2, 2), (4, 1, 1), (1, 4, 1), (1, 1, 4)]) / 6      # the same inside a triangle
 
 # places: triangles (n,) of the control mesh and barycentric coordinates (n, 3) -> points (n, 3), metres
 Displaced = Callable[[np.ndarray, np.ndarray], np.ndarray]
@@ -33,17 +34,17 @@ class Subdivision:
     """A finer triangulation of a control mesh."""
 
     faces: np.ndarray        # (f, 3)
-    parent: np.ndarray       # (n,), A triangle of the control mesh on which each vertex lies
+    parent: np.ndarray       # (n,), a triangle of the control mesh on which each vertex lies
     bary: np.ndarray         # (n, 3), its place there
     face_parent: np.ndarray  # (f,), the control triangle of every triangle
     chart: Chart             # the finer triangles in the image; vertices on a seam have several places in it
 
     def points(self, mesh: Mesh) -> np.ndarray:
-        """(n, 3) the vertices on a control mesh, not displaced."""
+        """Compute the vertices (n, 3) on a control mesh, not displaced."""
         return np.einsum("nc,ncd->nd", self.bary, mesh.vertices[mesh.faces[self.parent]])
 
     def mesh(self, mesh: Mesh) -> Mesh:
-        """The same surface as a control mesh, in more triangles."""
+        """Build the surface of a control mesh in the finer triangles."""
         return Mesh(self.points(mesh), self.faces)
 
 
@@ -59,28 +60,27 @@ class _Corners:
 
 
 def chart_places(chart: Chart, faces: np.ndarray, bary: np.ndarray) -> np.ndarray:
-    """Texture coordinates (n, 2) of places on triangles. [Statues] Eq. 21"""
+    """Compute texture coordinates (n, 2) of places on triangles. [Statues] Eq. 21"""
     return np.einsum("nc,ncd->nd", bary, chart.uv[chart.faces[faces]])
 
 
 def subdivide_uniform(mesh: Mesh, chart: Chart, level: int) -> Subdivision:
-    """Every triangle in four, `level` times over."""
+    """Divide every triangle into four, `level` times."""
     return _subdivide(mesh, chart, level, lambda now: np.ones(now.vertex.shape, dtype=bool))
 
 
 def subdivide_adaptive(mesh: Mesh, chart: Chart, displaced: Displaced, tolerance: float, level: int) -> Subdivision:
-    """Edges split, at most `level` times, where the displaced surface bends away from them by more than a tolerance,
-    metres.
+    """Split edges, at most `level` times, where the displaced surface is farther from them than a tolerance, metres.
 
-    An edge is split if the surface is farther from it anywhere along it, or at a place inside a triangle beside it: a
-    decision of the edge, the same for both sides, so that no vertex lies on a neighbour's edge. Fig. 16 of [Statues]
-    splits where the displacement is greater; a flat part needs no triangles, however far it is displaced.
+    The distance is tested along the edge and inside the triangles beside it. The decision is the same for both sides of
+    an edge, so no vertex lies on a neighbour's edge. Fig. 16 of [Statues] splits where the displacement is larger; but
+    a flat part needs no triangles, however far it is displaced.
     """
     return _subdivide(mesh, chart, level, lambda now: _find_curved_sides(now, displaced, tolerance))
 
 
 def _subdivide(mesh: Mesh, chart: Chart, level: int, choose: Callable[[_Corners], np.ndarray]) -> Subdivision:
-    """Sides (f, 3) that `choose` marks are split, `level` times over or until it marks none."""
+    """Split the sides (f, 3) that `choose` marks, `level` times or until it marks none."""
     now = _Corners(mesh.faces, chart.faces, np.tile(np.eye(3), (len(mesh.faces), 1, 1)), np.arange(len(mesh.faces)),
                    chart.uv)
     for _ in range(level):
@@ -94,7 +94,7 @@ def _subdivide(mesh: Mesh, chart: Chart, level: int, choose: Callable[[_Corners]
 
 
 def _sides(vertex: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Where every edge first occurs among the 3 f sides, and which edge each side (f, 3) is."""
+    """Find where every edge first occurs among the 3 f sides, and the edge of each side (f, 3)."""
     a, b = vertex, np.roll(vertex, -1, axis=1)
     key = np.minimum(a, b) * (vertex.max() + 1) + np.maximum(a, b)
     _, first, edge = np.unique(key, return_index=True, return_inverse=True)
@@ -102,7 +102,7 @@ def _sides(vertex: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _split(now: _Corners, marked: np.ndarray, mesh: Mesh) -> _Corners:
-    """The triangles with their marked sides (f, 3) split."""
+    """Split the marked sides (f, 3) of the triangles."""
     middle = 0.5 * (now.bary + np.roll(now.bary, -1, axis=1))
     vertex, _ = _with_middles(now.vertex, marked)
     row, halved = _with_middles(now.row, marked)
@@ -110,7 +110,7 @@ def _split(now: _Corners, marked: np.ndarray, mesh: Mesh) -> _Corners:
     bary = np.concatenate([now.bary, middle], axis=1)
     pattern = marked @ np.array([1, 2, 4])
     diagonals = {3: ((0, 4), (3, 2)), 6: ((1, 5), (4, 0)), 5: ((2, 3), (5, 1))}  # of the two ways
-    for number, ways in diagonals.items():                 # of two diagonals the shorter
+    for number, ways in diagonals.items():                 # with two split sides, choose the shorter diagonal
         which = np.flatnonzero(pattern == number)
         points = np.einsum("fkc,fcd->fkd", bary[which], mesh.corners[now.parent[which]])
         one, other = (np.linalg.norm(points[:, a] - points[:, b], axis=1) for a, b in ways)
@@ -128,7 +128,7 @@ def _split(now: _Corners, marked: np.ndarray, mesh: Mesh) -> _Corners:
 
 
 def _with_middles(faces: np.ndarray, marked: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Triangles (f, 6) by corners and middles, -1 where a side stays whole; and the ends (m, 2) of the split edges."""
+    """Add midpoints: triangles (f, 6) by corners and midpoints, -1 for whole sides, and ends (m, 2) of split edges."""
     first, edge = _sides(faces)
     count = faces.max() + 1
     split = marked.ravel()[first]
@@ -138,7 +138,7 @@ def _with_middles(faces: np.ndarray, marked: np.ndarray) -> tuple[np.ndarray, np
 
 
 def _find_curved_sides(now: _Corners, displaced: Displaced, tolerance: float) -> np.ndarray:
-    """(f, 3) sides along which the displaced surface is farther than the tolerance from the edge, or beside which."""
+    """Find sides (f, 3) along or beside which the displaced surface is farther than the tolerance."""
     first, edge = _sides(now.vertex)
     face, side = np.divmod(first, 3)
     ends = np.stack([now.bary[face, side], now.bary[face, (side + 1) % 3]], axis=1)
@@ -150,7 +150,7 @@ def _find_curved_sides(now: _Corners, displaced: Displaced, tolerance: float) ->
 
 
 def _deviation(corners: np.ndarray, parent: np.ndarray, probes: np.ndarray, displaced: Displaced) -> np.ndarray:
-    """(m,) how far the surface is, at most, from edges or triangles whose corners (m, k, 3) are on it."""
+    """Compute the largest distance (m,) of the surface from edges or triangles with corners (m, k, 3) on it."""
     count, k, p = len(corners), corners.shape[1], len(probes)
     at = displaced(np.repeat(parent, k), corners.reshape(-1, 3)).reshape(count, k, 3)
     between = np.einsum("pk,mkc->mpc", probes, corners).reshape(-1, 3)

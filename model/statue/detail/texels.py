@@ -1,4 +1,4 @@
-"""Images over a chart: their pixels, inside it and a little beyond its borders; colours of a scan, and normals."""
+"""Images over a texture chart: pixels inside it and a little beyond its border, colours of a scan, normal maps."""
 from __future__ import annotations
 
 from dataclasses import dataclass
@@ -27,9 +27,10 @@ class Texels:
     inside: np.ndarray  # (n,), in the chart; the others stand for the surface on the other side of the seam
 
     def image(self, values: np.ndarray, beyond: float | None = None) -> np.ndarray:
-        """An image (size, size, ...) of values (n, ...) of the pixels.
+        """Make an image (size, size, ...) of values (n, ...) of the pixels.
 
-        Elsewhere a number; or that of the nearest pixel as far as smaller copies of the image look, and 0 beyond.
+        Elsewhere it is `beyond`. Without that, the nearest pixel fills 16 pixels around, which smaller copies of the
+        image (mipmaps) read, and the rest is 0.
         """
         out = np.full((self.size**2, *values.shape[1:]), 0 if beyond is None else beyond, dtype=values.dtype)
         out[self.pixels] = values
@@ -41,7 +42,7 @@ class Texels:
         return out
 
     def neighbours(self) -> np.ndarray:
-        """(m, 2) pairs of pixels, as numbers in these arrays, that lie side by side in the image."""
+        """List pairs (m, 2) of pixels, as numbers in these arrays, that are neighbours in the image."""
         number = np.full((self.size, self.size), -1)
         number.ravel()[self.pixels] = np.arange(len(self.pixels))
         pairs = np.concatenate([np.stack([number[:, :-1].ravel(), number[:, 1:].ravel()], axis=1),
@@ -50,7 +51,7 @@ class Texels:
 
 
 def find_texels(mesh: Mesh, chart: Chart, size: int) -> Texels:
-    """The pixels of a square image of `size` pixels each way over the chart of a mesh, and four beyond its border."""
+    """Find the pixels of a square image over the chart of a mesh, and those up to four pixels beyond its border."""
     rows, columns, faces, bary = chart.texels(size)
     pixels = rows * size + columns
     far = _away(pixels, size)[0].ravel()
@@ -64,7 +65,7 @@ def find_texels(mesh: Mesh, chart: Chart, size: int) -> Texels:
 
 
 def _away(pixels: np.ndarray, size: int) -> tuple[np.ndarray, np.ndarray]:
-    """How far (size, size) every place of an image is from some pixels, and the nearest of these (2, size, size)."""
+    """Compute the distance (size, size) of every pixel from given ones, and the nearest of these (2, size, size)."""
     from scipy.ndimage import distance_transform_edt
 
     empty = np.ones(size**2, dtype=bool)
@@ -73,10 +74,10 @@ def _away(pixels: np.ndarray, size: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def continue_chart(mesh: Mesh, chart: Chart, uv: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Places of the control mesh, triangles (n,) and bary (n, 3), for points of the image (n, 2) beside the chart.
+    """Continue the chart: places on the control mesh, triangles (n,) and bary (n, 3), of image points (n, 2) beside it.
 
-    The triangle at the nearest border goes on in its plane; what lies beyond the seam is laid onto the triangle on its
-    other side, as if that were unfolded into the plane. At a border of the mesh itself the border's place is taken.
+    The triangle on the other side of the nearest seam is unfolded into the plane, and the point is a place on it. At a
+    border of the mesh itself, the nearest border point is taken.
     """
     import igl
 
@@ -88,6 +89,7 @@ def continue_chart(mesh: Mesh, chart: Chart, uv: np.ndarray) -> tuple[np.ndarray
     bary = np.clip(found.bary, 0, None)
     seam = np.flatnonzero(beyond >= 0)
     f, s, g, t = face[seam], side[seam], beyond[seam], back[face[seam], side[seam]]
+    # the point in the plane of the triangle: along the seam, and distance from it; then on the unfolded triangle
     at = np.einsum("nc,ncd->nd", planar_barycentric(uv[seam], *chart.uv[chart.faces[f]].swapaxes(0, 1)),
                    mesh.corners[f])
     a, b = mesh.vertices[mesh.faces[f, s]], mesh.vertices[mesh.faces[f, (s + 1) % 3]]
@@ -119,19 +121,19 @@ class Lattice:
         self._surface = Surface(self.fine)
 
     def sample(self, values: np.ndarray, faces: np.ndarray, bary: np.ndarray) -> np.ndarray:
-        """Values (n,) or (n, k) at places of the control mesh, linear between those of the fine vertices."""
+        """Interpolate values of the fine vertices at places of the control mesh: (n,) or (n, k)."""
         found = self._surface.closest(interpolate(self.control.mesh, faces, bary)[0])
         return np.einsum("nc,nc...->n...", found.bary, values[self.fine.faces[found.faces]])
 
     def gather(self, texels: Texels, values: np.ndarray, known: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """What the pixels (n,) say of the fine vertices, from one side of a seam; whether all around it are known."""
+        """Sample pixel values (n,) at the fine vertices, from one side of a seam; also whether all around are known."""
         uv = chart_places(self.control.chart, self.subdivision.parent, self.subdivision.bary)
         image, sure = texels.image(np.where(known, values, 0.0), 0.0), texels.image(known.astype(float), 0.0)
         return bilinear(image, uv), bilinear(sure, uv) > 1 - 1e-9
 
 
 def scan_look(scan: Mesh | Texture) -> Look:
-    """The colours of a scan, of its vertices or its picture, at the closest place; weight 0 where it has none."""
+    """Make a function of the colours of a scan, of vertices or texture, at the closest point; weight 0 without data."""
     mesh = scan.mesh if isinstance(scan, Texture) else scan
     if not isinstance(scan, Texture) and mesh.colors is None:
         raise ValueError("scan: expected colours of its vertices or a texture, found neither")
@@ -145,14 +147,16 @@ def scan_look(scan: Mesh | Texture) -> Look:
             assert mesh.colors is not None, "a scan without colours was refused"
             colors = np.einsum("nc,ncd->nd", found.bary, mesh.colors[mesh.faces[found.faces]])
         facing = np.einsum("nd,nd->n", mesh.face_normals[found.faces], normals)
-        # metres: farther away the scan does not say
+        # colours count within 1 cm, on surfaces that face the same way
         return colors, ((found.distances < 0.01) & (facing > 0)).astype(float)
     return look
 
 
 def bake_texture(control: ControlModel, map: DisplacementMap, look: Look) -> np.ndarray:
-    """(H, W, 3) uint8 colours over the chart of a control model, those of the displaced surface. Where `look` (places,
-    normals -> colours, weights) says nothing, they go over smoothly from those around, across seams too.
+    """Bake colours (H, W, 3) uint8 of the displaced surface over the chart of a control model.
+
+    `look` maps places and normals to colours and weights. Where weights are 0, colours are filled smoothly from around,
+    across seams too.
     """
     texels = find_texels(control.mesh, control.chart, len(map.heights))
     p, n = interpolate(control.mesh, texels.faces, texels.bary)
@@ -165,24 +169,24 @@ def bake_texture(control: ControlModel, map: DisplacementMap, look: Look) -> np.
         lattice = Lattice(control)
         found = [lattice.gather(texels, colors[:, k], known) for k in range(3)]
         values, sure = np.stack([value for value, _ in found], axis=1), found[0][1]
-        # where nothing at all is known
+        # light grey where nothing at all is known
         values = sparse.harmonic(lattice.fine.vertex_adjacency, np.where(sure[:, None], values, 0.6), sure)
         colors[~known] = lattice.sample(values, texels.faces[~known], texels.bary[~known])
     return texels.image((255 * np.clip(colors, 0, 1) + 0.5).astype(np.uint8))
 
 
 def vertex_of_row(mesh: Mesh, chart: Chart) -> np.ndarray:
-    """(M,) the vertex of every row of a chart's `uv`."""
+    """Find the vertex (M,) of every row of a chart's `uv`."""
     out = np.zeros(len(chart.uv), dtype=np.int64)
     out[chart.faces] = mesh.faces
     return out
 
 
 def chart_tangents(mesh: Mesh, chart: Chart) -> np.ndarray:
-    """(M, 4) tangents at every row of a chart, as MikkTSpace makes them, which glTF and Blender go by.
+    """Compute tangents (M, 4) at every row of a chart as MikkTSpace does, the standard of glTF and Blender.
 
-    Of each triangle the direction in which u grows, made perpendicular to the vertex normal, weighted by the
-    triangle's angle there; then the sign of `cross(normal, tangent) * sign`, the direction in which v grows.
+    A tangent is the direction in which u grows in each triangle, made perpendicular to the vertex normal and weighted
+    by the triangle's angle there. The sign makes `cross(normal, tangent) * sign` the direction in which v grows.
     """
     x, n = mesh.corners, mesh.vertex_normals[mesh.faces]                 # (F, 3, 3)
     uv = chart.uv[chart.faces]
@@ -202,9 +206,12 @@ def chart_tangents(mesh: Mesh, chart: Chart) -> np.ndarray:
 
 
 def normal_image(control: ControlModel, vertices: np.ndarray, subdivision: Subdivision, size: int) -> np.ndarray:
-    """(size, size, 3) uint8, the normals of the detailed surface, vertices (n, 3), in the frames of the control mesh: x
-    to the right in the image, y upwards, z outwards; -1 to 1 are 0 to 255, as glTF has them.
+    """Make the normal map (size, size, 3) uint8 of the detailed surface with vertices (n, 3).
+
+    Normals are in the tangent frames of the control mesh: x to the right in the image, y upwards, z outwards. Values
+    from -1 to 1 become 0 to 255, as in glTF.
     """
+    # tangent frames T, B, N of the control mesh at every pixel, then the fine normal there
     rows, columns, face, bary = control.chart.texels(size)
     N = np.einsum("nc,ncd->nd", bary, control.mesh.vertex_normals[control.mesh.faces[face]])
     T = np.einsum("nc,ncd->nd", bary, chart_tangents(control.mesh, control.chart)[control.chart.faces[face]])

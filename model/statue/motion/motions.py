@@ -34,13 +34,13 @@ from ..detail.subdivision import subdivide_uniform
 
 
 def read_statue_motion(statue: Statue, path: Path, rate: float | None = None) -> Retargeted:
-    """A motion for the skeleton of a statue: BVH, AMASS, or `.npz` of its own parts or of the synthetic people.
+    """Read a motion for a statue: BVH, AMASS, or `.npz` of its own parts or of the synthetic people.
 
     `rate` is frames a second, where the file does not say or says it wrongly.
     """
     control, people = statue.control, 16
     if path.suffix.lower() == ".bvh":
-        # travel: by the legs
+        # the unit does not matter, since travel is scaled by the legs
         return _with_file_name(path, bvh_motion, control, statue.pose, read_bvh(path, "cm", rate))
     stored = read_motion_file(path, rate=rate)
     count, own = stored.poses.shape[1], len(control.skeleton.parents)
@@ -55,7 +55,7 @@ def read_statue_motion(statue: Statue, path: Path, rate: float | None = None) ->
 
 
 def _with_file_name(path: Path, make: Callable[..., Retargeted], *given: object) -> Retargeted:
-    """What a function makes; its ValueError names the file."""
+    """Call a function; turn its ValueError into a StorageError that names the file."""
     try:
         return make(*given)
     except ValueError as problem:
@@ -63,10 +63,10 @@ def _with_file_name(path: Path, make: Callable[..., Retargeted], *given: object)
 
 
 def own_motion(control: ControlModel, path: str | Path, rate: float | None = None) -> Retargeted:
-    """A motion file (`poses`, `trans`, `mocap_frame_rate`) of the statue's own parts.
+    """Read a motion file (`poses`, `trans`, `mocap_frame_rate`) of the statue's own parts.
 
-    In such files trans is the travel of the middle of part 0, as body models place themselves; here that of the root's
-    joint, as in a rig. Skinning moves the one a little against the other.
+    In such files trans is the travel of the centroid of part 0, as in body models. Here it becomes that of the root's
+    joint, as in a rig. Skinning moves one relative to the other a little.
     """
     return _own(control, path, read_motion_file(path, rate=rate))
 
@@ -88,18 +88,18 @@ def write_body_motion(path: str | Path, control: ControlModel, motion: Retargete
 
 
 def middle_drift(control: ControlModel, poses: np.ndarray) -> np.ndarray:
-    """(T, 3) how far skinning moves the middle of part 0 from the root's joint in poses (T, J, 3), metres."""
+    """Compute the shift (T, 3), metres, of the centroid of part 0 from the root's joint in poses (T, J, 3)."""
     ids, share = control.skeleton.joint_weights(control.mesh, 0)
-    some = replace(control.rig, mesh=Mesh(control.mesh.vertices[ids], np.zeros((0, 3), dtype=np.int64)),
+    root_rig = replace(control.rig, mesh=Mesh(control.mesh.vertices[ids], np.zeros((0, 3), dtype=np.int64)),
                    weights=control.weights[ids], shapes=np.zeros((0, len(ids), 3)))
-    return np.asarray(share @ some.vertices(poses) - control.skeleton.joints[0])
+    return np.asarray(share @ root_rig.vertices(poses) - control.skeleton.joints[0])
 
 
 def people_motion(control: ControlModel, pose: np.ndarray, poses: np.ndarray, trans: np.ndarray | None = None,
                   rate: float = 60.0, girdle: float = 0.2) -> Retargeted:
-    """A motion of the synthetic people, poses (T, 16, 3) and trans (T, 3) of the average person, for a statue's `pose`.
+    """Transfer a motion of the synthetic people, poses (T, 16, 3) and trans (T, 3), to a statue with its `pose`.
 
-    The generic control model rests as they do, so the rotations of the parts in the world carry over.
+    The generic control model has the same rest pose, so world rotations of the parts are copied.
     """
     skeleton = _average_skeleton()
     poses, trans = check_motion(skeleton, poses, trans, rate)
@@ -111,20 +111,19 @@ def people_motion(control: ControlModel, pose: np.ndarray, poses: np.ndarray, tr
 
 @lru_cache(maxsize=1)
 def _average_skeleton() -> Skeleton:
-    """That of the average synthetic person, whose surface takes a second to make."""
+    """Build the skeleton of the average synthetic person, kept since its surface takes a second to make."""
     from scanprep.synthetic.people import SyntheticPerson
 
     return SyntheticPerson().skeleton
 
 
 def bvh_motion(control: ControlModel, pose: np.ndarray, bvh: MovingSkeleton) -> Retargeted:
-    """The motion of a BVH file, by the names of its joints and the directions of its bones, for a statue's `pose`.
+    """Retarget the motion of a BVH file to a statue with its `pose`, by names of joints and directions of bones.
 
-    A part follows the rotation of its joint against the rest of the file, in which somebody stands upright. A trunk of
-    any number of joints becomes one rotation that brings neck and shoulders nearest to where it brings them. Travel is
-    scaled by the length of the legs, so the unit of the file does not matter; the statue starts where the scan stands.
-    Upwards is the axis of the file that is nearest to the trunk at rest: y, as BVH says, but some programs write z.
-    ValueError for names that say too little.
+    A part follows the rotation of its joint relative to the rest pose of the file, in which a person stands upright. A
+    trunk of any number of joints becomes one rotation that carries neck and shoulders as nearly as possible. Travel is
+    scaled by the legs, so the unit of the file does not matter. The statue starts where the scan stands. Up is the axis
+    of the file nearest to the trunk at rest: y in BVH, but some programs write z. ValueError for unknown names.
     """
     same = copy_motion(control.skeleton, control.mesh, control.rig.vertices, bvh)
     return same or retarget_pair(Pairing(control.skeleton, control.rig.vertices, bvh, pose), here=True)
@@ -145,7 +144,7 @@ class BoundControl:
             raise ValueError(f"registered: expected shape {body.vertices.shape}, got {registered.shape}")
         near = body if registered is None else body.with_vertices(registered)
         self._bind = _bound(mesh, near)
-        # how much the turn of each edge counts around each vertex of the body: over four rings
+        # weights of the edges whose rotation is averaged around each vertex of the body: over four rings
         N, edges = len(body.vertices), body.edges
         ends = sparse.gatherer(edges.T.ravel(), N) @ vstack([eye_array(len(edges))] * 2)
         ring = (body.vertex_adjacency != 0).astype(float) + eye_array(N)
@@ -157,7 +156,7 @@ class BoundControl:
         self._offset = mesh.vertices - self._bind @ body.vertices
 
     def vertices(self, poses: np.ndarray, trans: np.ndarray | None = None) -> np.ndarray:
-        """The control mesh (..., n, 3), metres, in poses (..., J, 3) of the model."""
+        """Compute the control mesh (..., n, 3), metres, in poses (..., J, 3) of the model."""
         if poses.ndim == 2:
             return self._move(self.subject.vertices(poses, trans))
         trans = np.broadcast_to(np.zeros(3) if trans is None else trans, (len(poses), 3))
@@ -172,7 +171,7 @@ class BoundControl:
 
 
 def _bound(mesh: Mesh, body: Mesh) -> csr_array:
-    """(n, N) barycentric weights of the point of the body for each control vertex, with a compatible normal."""
+    """Bind each control vertex to a body point with a compatible normal: barycentric weights (n, N)."""
     close = Surface(body).closest(mesh.vertices)
     corners, weights = body.faces[close.faces].copy(), close.bary.copy()
     facing = np.einsum("nd,nd->n", np.einsum("nc,ncd->nd", weights, body.vertex_normals[corners]), mesh.vertex_normals)
@@ -189,7 +188,7 @@ def _bound(mesh: Mesh, body: Mesh) -> csr_array:
 
 def follower_of(statue: Statue, model: BodyModel, registered: np.ndarray | None = None,
                 progress: Callable[[int, int], None] | None = None) -> BoundControl:
-    """The control mesh bound to a learned model, whose template, if not `registered`, is registered first."""
+    """Bind the control mesh to a learned model, whose template is registered first, unless `registered` is given."""
     control, pairs, hints = statue.control, None, None
     if registered is None:
         surface = Reconstruction(control, statue.map, subdivide_uniform(control.mesh, control.chart, 2)).mesh()

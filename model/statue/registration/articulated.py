@@ -13,7 +13,7 @@ from ..control.model import ControlModel
 
 @dataclass(frozen=True, eq=False)
 class BoundPoints:
-    """Points that hang on a control model, by the weights (n, J) of its parts, in the default pose (n, 3), metres."""
+    """Points carried by a control model: blend weights (n, J) of its parts, and the default pose (n, 3), metres."""
 
     weights: np.ndarray
     rest: np.ndarray
@@ -21,7 +21,7 @@ class BoundPoints:
 
 @dataclass(frozen=True, eq=False)
 class Frames:
-    """Where the J parts are for one set of parameters."""
+    """Rotations, joints and shapes of the J parts for one set of parameters."""
 
     R: np.ndarray       # (J, 3, 3), world rotation of every part
     joints: np.ndarray  # (J, 3) metres
@@ -34,10 +34,10 @@ class Frames:
 class Articulated:
     """The control model as a function of its parameters x: angles (A,), length factors (S,), place (3,).
 
-    A length factor moves the joints on its parts as in Eq. 3. Eq. 2 alone would leave the vertices at their offsets
-    from the joints, so that a longer forearm were a gap: here a part with one bone is stretched along it by the
-    factor, and across it by the size factor, the mean of all factors weighted by the default lengths. A part on
-    which several joints hang (pelvis, trunk) has no one direction and grows by its factor in all.
+    A length factor moves the joints on its parts as in Eq. 3. By Eq. 2 alone the vertices would keep their offsets from
+    the joints, and a longer forearm would leave a gap. So a part with one bone is stretched along it by the factor, and
+    across it by the size factor: the mean of all factors, weighted by the default lengths. A part with several joints
+    on it (pelvis, trunk) grows by its factor in all directions.
 
     [Statues] Eq. 1, 2, 3
     """
@@ -62,8 +62,9 @@ class Articulated:
 
     @cached_property
     def bones(self) -> np.ndarray:
-        """(J, 3) metres, from the joint of every part to where its bone ends: the joint of a child of the same segment,
-        else the farthest child, else the farthest of the vertices that it carries most.
+        """(J, 3) metres, from the joint of every part to the end of its bone.
+
+        That is the joint of a child of the same segment, else the farthest child, else the farthest of its vertices.
         """
         control, o = self.control, self.control.skeleton.joints
         segment, out = control.segment_of_part, np.zeros_like(o)
@@ -112,22 +113,22 @@ class Articulated:
         return BoundPoints(self.control.weights, self.control.mesh.vertices)
 
     def split(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Angles (A,), length factors (S,) and place (3,)."""
+        """Split parameters into angles (A,), length factors (S,) and place (3,)."""
         A, S = len(self.axes), len(self.lengths)
         return x[:A], x[A:A + S], x[A + S:]
 
     def pose(self, x: np.ndarray) -> np.ndarray:
-        """(J, 3) radians: `exp(angles @ axes)` rotates every part in its parent."""
+        """Compute the pose (J, 3), radians: `exp(angles @ axes)` rotates every part in its parent."""
         pose = np.zeros_like(self.control.skeleton.joints)
         np.add.at(pose, self.joint_of, self.split(x)[0][:, None] * self.axes)
         return pose
 
     def size(self, x: np.ndarray) -> float:
-        """The size factor."""
+        """Compute the size factor."""
         return float(self.shares @ self.split(x)[1])
 
     def frames(self, x: np.ndarray) -> Frames:
-        """Rotations and joints of all parts. [Statues] Eq. 3"""
+        """Compute rotations and joints of all parts, with derivatives by the lengths. [Statues] Eq. 3"""
         skeleton, segment = self.control.skeleton, self.control.segment_of_part
         _, factors, place = self.split(x)
         pose, o = self.pose(x), skeleton.joints
@@ -147,11 +148,12 @@ class Articulated:
         return Frames(R, joints, shapes, axes, shifts)
 
     def positions(self, frames: Frames, points: BoundPoints) -> np.ndarray:
-        """Where points are (n, 3), metres. [Statues] Eq. 2"""
+        """Compute the positions (n, 3) of points, metres. [Statues] Eq. 2"""
         return np.einsum("nj,njd->nd", points.weights, self._by_part(frames, points))
 
     def derivatives(self, frames: Frames, points: BoundPoints) -> np.ndarray:
-        """(n, 3, P) of the positions by the parameters."""
+        """Compute the derivatives (n, 3, P) of the positions by the parameters."""
+        # by an angle: its axis times the arm to all that hangs below; by a length: joints, and the stretch of parts
         skeleton, w = self.control.skeleton, points.weights
         n, J = w.shape
         below = skeleton.descends.astype(float)
@@ -166,11 +168,11 @@ class Articulated:
         return np.concatenate([by_angle, by_length, np.broadcast_to(np.eye(3), (n, 3, 3))], axis=2)
 
     def _by_part(self, frames: Frames, points: BoundPoints) -> np.ndarray:
-        """(n, J, 3) where each part alone would carry each point."""
+        """Compute where each part alone would carry each point, (n, J, 3)."""
         d = points.rest[:, None] - self.control.skeleton.joints
         return frames.joints + _each(frames.R @ frames.shapes, d)
 
 
 def _each(M: np.ndarray, d: np.ndarray) -> np.ndarray:
-    """(n, J, 3): the matrices M (J, 3, 3) of the parts, each times its vectors in d (n, J, 3)."""
+    """Multiply the matrices M (J, 3, 3) of the parts with their vectors in d (n, J, 3)."""
     return (d.transpose(1, 0, 2) @ M.transpose(0, 2, 1)).transpose(1, 0, 2)

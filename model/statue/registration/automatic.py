@@ -21,13 +21,13 @@ from .features import FeatureFit, fit_features
 from .person_search import find_stand
 
 SHOWN = 0.3                      # share of the vertices around a joint or landmark, or of a limb, that must have data
-# How far, metres, the posed body stays off a scan at most, and how many times farther, at least, when it faces another
-# way. Six synthetic persons: 11 to 13 mm, 1.7 to 3.3 times; nine real ones, five of them bent: 18 to 21 mm, 1.5 to 2.9;
-# fronts and sides alone 21 mm, 1.35 to 1.6. A cylinder 47 mm, 1.13; a chair 56 mm; two people 65 and 70 mm.
+# Largest distance, metres, of the posed body from a scan, and least ratio of that distance when it faces another way.
+# Six synthetic persons: 11 to 13 mm, ratio 1.7 to 3.3. Nine real ones, five of them bent: 18 to 21 mm, 1.5 to 2.9.
+# Fronts and sides alone: 21 mm, 1.35 to 1.6. A cylinder: 47 mm, 1.13; a chair: 56 mm; two people: 65 and 70 mm.
 OFF, MARGIN = 0.042, 1.05
 DOUBTED_OFF, DOUBTED_MARGIN = 0.025, 1.2         # a leg alone has 25 mm; dressed persons need a look
-# Share of a scan off the body that was bent onto it: synthetic persons 0.005; three dressed ones 0.09 to 0.26, one with
-# long hair 0.07
+# share of a scan off the fitted body that is doubtful: synthetic persons have 0.005, three dressed ones 0.09 to 0.26,
+# one with long hair 0.07
 MISSED = 0.05
 
 
@@ -45,10 +45,10 @@ class Features:
 
 @one_thread()
 def find_features(control: ControlModel, scan: Mesh) -> Features:
-    """Joint centres and landmarks of a person who stands upright, by a control model that is a humanoid.
+    """Find joint centres and landmarks of a person who stands upright, by a humanoid control model.
 
-    Neither unit nor axes of the scan need to be known; it may have holes, or show a part of a person. The control
-    model, z up and facing -y, is placed in many ways, the best are bent onto the scan, and of them one is registered.
+    Unit and axes of the scan need not be known. It may have holes, or show a part of a person. The control model, z up
+    and facing -y, is placed in many ways; the best are posed to fit the scan, and one of them is registered.
     """
     if len(scan.vertices) < 100:
         raise ValueError(f"scan: expected a person of at least 100 points, got {scan}")
@@ -63,12 +63,12 @@ def find_features(control: ControlModel, scan: Mesh) -> Features:
     if problem:
         return Features({}, {}, (*control.skeleton.names, *control.landmarks), None, None, problem)
     placed = data.with_vertices(metres * data.vertices) if isinstance(data, Mesh) else metres * data
-    found = register(best.mesh, placed, config=RegistrationConfig(graph=RegistrationConfig().graph[-2:]),
+    result = register(best.mesh, placed, config=RegistrationConfig(graph=RegistrationConfig().graph[-2:]),
                      start=np.eye(4))
-    joints, points, missing = _features(control, found, placed, metres)
+    joints, points, missing = _features(control, result, placed, metres)
     fit = fit_features(control, joints, points) if len(joints) + len(points) > 2 else None
-    registered = control.mesh.with_vertices(found.mesh.vertices / metres)
-    problem = why_uncertain(best.off, margin, found.uncovered) if fit else (
+    registered = control.mesh.with_vertices(result.mesh.vertices / metres)
+    problem = why_uncertain(best.off, margin, result.uncovered) if fit else (
         f"{number_of(len(joints), 'joint')} and {number_of(len(points), 'point')} of the face have data around them, "
         "too few to place a person: "
         "a part of one only?")
@@ -76,7 +76,7 @@ def find_features(control: ControlModel, scan: Mesh) -> Features:
 
 
 def nobody_problem(off: float, margin: float, size: str) -> str | None:
-    """Why there is no person in a scan, or none that stands upright; None where there is one."""
+    """Explain why there is no person in a scan, or none that stands upright; None where there is one."""
     if off <= OFF and margin >= MARGIN:
         return None
     return (f"no person who stands upright was found (the unit taken for {size}): a body bent onto the scan stays "
@@ -86,7 +86,7 @@ def nobody_problem(off: float, margin: float, size: str) -> str | None:
 
 
 def why_uncertain(off: float, margin: float, missed: float) -> str | None:
-    """Why features should not be trusted, as of a person with a limb in a wrong place; None where they may be."""
+    """Explain why features should not be trusted, as with a limb in a wrong place; None where they may be."""
     reasons = [text for text, wrong in (
         (f"the posed body stays {1000 * off:.0f} mm off the scan", off > DOUBTED_OFF),
         (f"facing another way it fits only {margin:.2f} times worse", margin < DOUBTED_MARGIN),
@@ -95,39 +95,39 @@ def why_uncertain(off: float, margin: float, missed: float) -> str | None:
 
 
 def guess_person_unit(points: np.ndarray) -> str:
-    """The unit in which points (n, 3) span most nearly as much as a person."""
+    """Guess the unit in which points (n, 3) are about as long as a person, 1.7 m."""
     longest = max(_length(points), 1e-12)
     return min(UNITS, key=lambda unit: abs(np.log(longest * UNITS[unit] / 1.7)))                # metres
 
 
 def _length(points: np.ndarray) -> float:
-    """How far points (n, 3) span along the way in which they spread most."""
+    """Compute the extent of points (n, 3) along their principal direction."""
     spread = points - points.mean(axis=0)
     return float(np.ptp(spread @ np.linalg.svd(spread[:: max(1, len(spread) // 5000)], full_matrices=False)[2][0]))
 
 
 def _features(control: ControlModel, found: Registration, scan: Mesh | np.ndarray, metres: float
               ) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray], tuple[str, ...]]:
-    """Joints and points with data around them, in the unit of the scan, and the names of the others."""
+    """Collect joints and points with data around them, in the unit of the scan, and the names of the others."""
     skeleton, near = control.skeleton, control.mesh.vertex_adjacency
     x, seen = found.mesh.vertices, found.confidence
     centres = skeleton.joint_regressor(control.mesh) @ x / metres
     around = (near @ seen + seen) / (near.sum(axis=1) + 1)
     shown = np.array([seen[skeleton.joint_weights(control.mesh, j)[0]].mean() > SHOWN for j in range(len(centres))])
     part = control.weights.argmax(axis=1)
-    # a limb has data of its own where the nearest points of the scan are not near the rest of the body as well: a hand
-    # on the thigh, where no forearm was scanned, is the thigh
+    # a limb has data of its own only where its nearest scan points are not near the rest of the body as well. Otherwise
+    # points of a thigh could count as a hand on it.
     data = scan.vertices if isinstance(scan, Mesh) else scan
     nearest = data[cKDTree(data).query(x, workers=search_threads(len(x)))[1]]
     of_face = part[control.mesh.faces].min(axis=1)
     for j, parent in enumerate(skeleton.parents):
         limb = np.flatnonzero(skeleton.descends[:, j])
-        mine = np.isin(part, limb)
-        if parent >= 0 and mine.any():
+        of_limb = np.isin(part, limb)
+        if parent >= 0 and of_limb.any():
             rest = found.mesh.submesh(~np.isin(of_face, limb))[0]
-            # metres from the rest of the body: points that are nearer say nothing of a limb
-            own = Surface(rest).closest(nearest[mine]).distances > 0.02
-            shown[j] &= bool((own * seen[mine]).mean() > SHOWN)
+            # points within 2 cm of the rest of the body are not evidence of a limb
+            own = Surface(rest).closest(nearest[of_limb]).distances > 0.02
+            shown[j] &= bool((own * seen[of_limb]).mean() > SHOWN)
         shown[j] &= parent <= 0 or shown[parent]
     joints = {name: centres[j] for j, name in enumerate(skeleton.names) if shown[j]}
     places = x / metres

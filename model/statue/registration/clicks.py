@@ -1,4 +1,4 @@
-"""Features that somebody clicked: joint centres and points of the surface, and how deep a joint lies behind a click."""
+"""Clicked features: joint centres and surface points, and the depth of a joint behind a click."""
 from __future__ import annotations
 
 from pathlib import Path
@@ -17,20 +17,20 @@ from ..control.model import ControlModel
 
 def read_features(path: Path, control: ControlModel, scan: Mesh, unit: str | None = None
                   ) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
-    """Joint centres and surface points, metres, by the names of the control model's joints and landmarks.
+    """Read joint centres and surface points, metres, by the names of the control model's joints and landmarks.
 
     Any landmark file is read, in its `unit`. In JSON a joint may also be a click, `{"ray": [origin, direction],
     "depth": d}`: its centre is then on the ray, where that is nearest to the medial axis of the scan, and d farther.
     """
-    rays, found = _read_clicks(path, unit) if path.suffix == ".json" else ({}, {})
+    rays, places = _read_clicks(path, unit) if path.suffix == ".json" else ({}, {})
     if not rays:
-        found = read_landmarks(path, scan, unit)
+        places = read_landmarks(path, scan, unit)
     known = {*control.skeleton.names, *control.landmarks}
-    strange = [name for name in [*rays, *found] if name not in known]
+    strange = [name for name in [*rays, *places] if name not in known]
     if strange:
         raise ValueError(f"{path}: the control model has no joint or landmark '{strange[0]}'; its joints are "
                          f"{', '.join(control.skeleton.names)}; its landmarks {', '.join(control.landmarks)}")
-    joints = {name: place for name, place in found.items() if name in control.skeleton.names}
+    joints = {name: place for name, place in places.items() if name in control.skeleton.names}
     if rays:
         medial = MedialAxis(scan)
         for name, click in rays.items():
@@ -38,12 +38,12 @@ def read_features(path: Path, control: ControlModel, scan: Mesh, unit: str | Non
                 joints[name] = medial.nearest_to_ray(*click)
             except ValueError as error:
                 raise ValueError(f"{path}: {name}: {error}") from None
-    return joints, {name: place for name, place in found.items() if name in control.landmarks}
+    return joints, {name: place for name, place in places.items() if name in control.landmarks}
 
 
 def _read_clicks(path: Path, unit: str | None) -> tuple[dict[str, tuple[np.ndarray, np.ndarray, float]],
                                                         dict[str, np.ndarray]]:
-    """Origin, direction and depth of the clicks of a file, and its plain places; nothing where it has no click."""
+    """Read origin, direction and depth of the clicks in a file, and its plain points; nothing without clicks."""
     wanted = 'features {name: [x, y, z]} or {name: {"ray": [[x, y, z], [x, y, z]], "depth": d}}'
     tree, metre = read_json(path, wanted), metres_of(unit)
     with taking_apart(path, wanted):
@@ -79,7 +79,7 @@ class MedialAxis:
                              "on; is the mesh in metres?")
         cells = np.indices(shape.astype(int)).reshape(3, -1).T
         winding = igl.fast_winding_number(vertices, faces, self._origin + voxel * (cells + 0.5))
-        # around a hole it falls smoothly from 1 to 0
+        # the winding number falls smoothly from 1 to 0 around a hole
         self.inside = (np.asarray(winding) > 0.5).reshape(shape.astype(int))
         self.points = self._origin + voxel * (np.argwhere(skeletonize(self.inside, method="lee")) + 0.5)
         if not len(self.points):
@@ -87,7 +87,7 @@ class MedialAxis:
         self._tree = cKDTree(self.points)
 
     def nearest_to_ray(self, origin: np.ndarray, direction: np.ndarray, depth: float = 0.0) -> np.ndarray:
-        """The point (3,) of a ray, on its first way through the body, nearest to the medial axis; `depth` farther."""
+        """Find the point (3,) of a ray nearest to the medial axis, where it first is in the body; `depth` farther."""
         if not np.linalg.norm(direction) > 0:
             raise ValueError(f"direction: expected a length, got {direction}")
         along = direction / np.linalg.norm(direction)
@@ -98,7 +98,7 @@ class MedialAxis:
         return np.asarray(origin + (t_point + depth) * along)
 
     def _stretch(self, origin: np.ndarray, along: np.ndarray) -> np.ndarray:
-        """Distances along a ray, a quarter of a voxel apart, at which it first is inside the body."""
+        """Sample the first stretch of a ray inside the body: distances a quarter of a voxel apart."""
         shape = np.array(self.inside.shape)
         middle = (self._origin + 0.5 * self.voxel * shape - origin) @ along
         radius = 0.5 * self.voxel * float(np.linalg.norm(shape))

@@ -16,7 +16,7 @@ from .articulated import Articulated, BoundPoints
 
 @dataclass(frozen=True, eq=False)
 class FeatureFit:
-    """The control model in the pose, with the lengths and at the place of a scan."""
+    """Result of `fit_features`: the control model with pose, segment lengths and place of a scan."""
 
     pose: np.ndarray      # (J, 3) radians, as `Skeleton.part_rotations` takes it
     lengths: np.ndarray   # (S,) metres, of the segments
@@ -29,11 +29,10 @@ class FeatureFit:
 
 def fit_features(control: ControlModel, joints: Mapping[str, np.ndarray],
                  points: Mapping[str, np.ndarray] | None = None) -> FeatureFit:
-    """Pose, segment lengths and place of a control model that bring its features, by name, to those of a scan.
+    """Fit pose, segment lengths and place of a control model to features of a scan, by name.
 
-    What they leave open (the twist of an arm with a straight elbow, the length of a hand) a weak prior keeps near the
-    default pose and lengths. ValueError for unknown names, places that are not finite, fewer than three features that
-    are not on one line.
+    A weak prior keeps what they leave open (the twist of an arm with a straight elbow, the length of a hand) near the
+    default. ValueError for unknown names, points that are not finite, or fewer than three features off a line.
 
     [Statues] Eq. 4
     """
@@ -48,7 +47,7 @@ def fit_features(control: ControlModel, joints: Mapping[str, np.ndarray],
     bounds = np.concatenate([model.limits, [[0.4, 2.5]] * len(model.lengths), [[-np.inf, np.inf]] * 3])
     at = {name: goal[k] for k, name in enumerate(joints)}
     start = np.clip(analytic_start(model, at), *bounds.T)
-    # Each unknown is measured by what it moves: a hand and the whole body alike, in millimetres.
+    # scale each unknown by how far it moves the features, so that all have about the same effect, in millimetres
     reach = np.linalg.norm(model.derivatives(model.frames(start), features), axis=(0, 1))
     unit = 1e-3 / np.maximum(reach, 0.03 * reach.max())
 
@@ -56,14 +55,14 @@ def fit_features(control: ControlModel, joints: Mapping[str, np.ndarray],
         x = unit * z
         value, slope = feature_misfit(model, x, features, goal)
         off = (x - model.rest)[:-3]
-        off[:3] = 0                                             # the way the body stands is nobody's default
-        # one radian, or a length twice the default one, is worth a misfit of 1 mm: what the features leave open
+        off[:3] = 0                                             # the root's rotation has no prior
+        # one radian, or twice the default length, costs as much as a misfit of 1 mm
         slope[:-3] += 2e-6 * off
         return 1e6 * (value + 1e-6 * float(off @ off)), 1e6 * unit * slope
 
-    found = minimize(energy, start / unit, jac=True, method="L-BFGS-B", bounds=bounds / unit[:, None],
+    result = minimize(energy, start / unit, jac=True, method="L-BFGS-B", bounds=bounds / unit[:, None],
                      options={"maxiter": 2000, "maxfun": 4000, "ftol": 1e-9, "gtol": 1e-6, "maxcor": 50})
-    x = np.clip(unit * found.x, *bounds.T)
+    x = np.clip(unit * result.x, *bounds.T)
     frames = model.frames(x)
     pose = model.pose(x)
     pose[0] = rotations.log(R @ rotations.exp(pose[0]))
@@ -71,12 +70,12 @@ def fit_features(control: ControlModel, joints: Mapping[str, np.ndarray],
     apart = scale * np.linalg.norm(model.positions(frames, features) - goal, axis=1)
     vertices = scale * model.positions(frames, model.vertices) @ R.T + T[:3, 3]
     return FeatureFit(pose, scale * model.split(x)[1] * model.lengths, vertices, centres, _rms(apart[:len(joints)]),
-                      _rms(apart[len(joints):]), bool(found.success))
+                      _rms(apart[len(joints):]), bool(result.success))
 
 
 def feature_misfit(model: Articulated, x: np.ndarray, features: BoundPoints, goal: np.ndarray) -> tuple[float,
                                                                                                         np.ndarray]:
-    """Sum of squares between features and where they are wanted (n, 3), and its gradient (P,). [Statues] Eq. 4"""
+    """Compute the sum of squared distances of features from goals (n, 3), and its gradient (P,). [Statues] Eq. 4"""
     frames = model.frames(x)
     off = model.positions(frames, features) - goal
     return float(np.sum(off**2)), 2 * np.einsum("nd,ndp->p", off, model.derivatives(frames, features))
@@ -84,11 +83,13 @@ def feature_misfit(model: Articulated, x: np.ndarray, features: BoundPoints, goa
 
 def warp(vertices: np.ndarray, from_points: np.ndarray, to_points: np.ndarray, share: np.ndarray | None = None
          ) -> np.ndarray:
-    """Carry vertices (N, 3) along with points (n, 3), by the smoothest displacement of space (φ(p) = |p|³ with an
-    affine part), of which each vertex takes its `share` (N,). [Statues] Eq. 5
+    """Warp vertices (N, 3) so that points (n, 3) reach their goals, each vertex by its `share` (N,).
 
-    The paper prints φ(p_k^H - p_k^C), a constant; interpolation needs φ(p - p_k^C). ValueError for points in one plane:
-    the affine part would be anything across it, and the back of a head would go anywhere.
+    The displacement of space is the smoothest one: φ(p) = |p|³ with an affine part. The paper prints φ(p_k^H - p_k^C),
+    a constant; interpolation needs φ(p - p_k^C). ValueError for points in one plane, which do not determine the affine
+    part: the back of a head could go anywhere.
+
+    [Statues] Eq. 5
     """
     from scipy.interpolate import RBFInterpolator
 
@@ -100,17 +101,17 @@ def warp(vertices: np.ndarray, from_points: np.ndarray, to_points: np.ndarray, s
 
 
 def head_share(control: ControlModel) -> np.ndarray:
-    """(N,) from 1 on the head to 0 beyond it: w²(3 - 2w) of its skinning weight, flat at both ends of the neck."""
+    """Compute shares (N,) from 1 on the head to 0 beyond: w²(3 - 2w) of its blend weight, flat at both ends."""
     w = control.weights[:, control.skeleton.names.index("skullbase")]
     return w * w * (3 - 2 * w)
 
 
 def _features(control: ControlModel, joints: Mapping[str, np.ndarray], points: Mapping[str, np.ndarray]
               ) -> tuple[BoundPoints, np.ndarray]:
-    """The features on the control model and where they are wanted (n, 3): joints first."""
+    """Collect the features on the control model and their goals (n, 3), joints first."""
     names = control.skeleton.names
-    for what, given, known in (("joints", joints, names), ("points", points, control.landmarks)):
-        unknown = [name for name in given if name not in known]
+    for what, named, known in (("joints", joints, names), ("points", points, control.landmarks)):
+        unknown = [name for name in named if name not in known]
         if unknown:
             raise ValueError(f"{what}: the control model has no {', '.join(map(repr, unknown))}, it has "
                              f"{', '.join(known)}")
@@ -125,7 +126,7 @@ def _features(control: ControlModel, joints: Mapping[str, np.ndarray], points: M
 
 
 def _place(model: Articulated, features: BoundPoints, joints: Mapping[str, np.ndarray], goal: np.ndarray) -> np.ndarray:
-    """The similarity (4, 4) of the trunk, from the bases of the limbs where they suffice, else from all features."""
+    """Fit a similarity (4, 4) of the trunk, by the bases of the limbs where they suffice, else by all features."""
     bases = [model.control.skeleton.names[base] for base, _, _ in limb_joints(model)]
     trunk = [k for k, name in enumerate(joints) if name in bases]
     for rows in (trunk, list(range(len(goal)))):
@@ -144,20 +145,20 @@ def _rms(distances: np.ndarray) -> float:
 
 
 def limb_joints(model: Articulated) -> list[tuple[int, int, int | None]]:
-    """Base, middle and end joint of every limb: a joint of three axes, on it one of one axis, and what it carries."""
+    """List base, middle and end joint of every limb: a joint with three axes, a hinge on it, and the hinge's child."""
     freedom = np.bincount(model.joint_of, minlength=len(model.control.axes))
     parents = model.control.skeleton.parents
-    found = []
+    limbs = []
     for middle in range(1, len(parents)):
         base = int(parents[middle])
         if base > 0 and freedom[middle] == 1 and freedom[base] == 3:
             ends = np.flatnonzero(parents == middle)
-            found.append((base, middle, int(ends[0]) if len(ends) else None))
-    return found
+            limbs.append((base, middle, int(ends[0]) if len(ends) else None))
+    return limbs
 
 
 def analytic_start(model: Articulated, at: Mapping[str, np.ndarray]) -> np.ndarray:
-    """Lengths from joints that are neighbours, and each limb from its base, middle and end joints in closed form."""
+    """Compute a start: lengths from neighbouring joints, and limbs from base, middle and end joints in closed form."""
     skeleton, x = model.control.skeleton, model.rest.copy()
     o, names = skeleton.joints, skeleton.names
     angles, factors, _ = model.split(x)
@@ -180,10 +181,10 @@ def analytic_start(model: Articulated, at: Mapping[str, np.ndarray]) -> np.ndarr
 
 def limb_angles(model: Articulated, base: int, middle: int, end: int | None, goal: np.ndarray
                 ) -> tuple[np.ndarray, float]:
-    """Angles (3,) of the base joint and of the middle one that point bones along goals, in the axes above.
+    """Compute angles (3,) of the base joint and that of the hinge which point bones along goals.
 
-    A hinge has two angles at which two bones enclose the right one: of these the one that is farther inside the limits
-    of both joints, or else nearer to the default pose.
+    A hinge has two angles at which the bones enclose the right angle. The one that better respects the limits of both
+    joints is taken, or else the one nearer to the default pose.
     """
     o, of_base, of_hinge = model.control.skeleton.joints, model.joint_of == base, model.joint_of == middle
     bones = _unit(np.array([o[middle] - o[base], *([o[end] - o[middle]] if len(goal) == 2 else [])]))
@@ -192,7 +193,7 @@ def limb_angles(model: Articulated, base: int, middle: int, end: int | None, goa
     for bend in _bends(hinge, bones[0], bones[1], float(goal[0] @ goal[1])) if len(goal) == 2 else np.zeros(1):
         allowed = float(np.clip(bend, *model.limits[of_hinge][0]))
         bent = np.concatenate([bones[:1], bones[1:] @ rotations.exp(allowed * hinge).T])
-        # The identity decides how a straight limb is rotated about itself.
+        # a small multiple of the identity decides the twist of a straight limb
         H = goal.T @ bent + 1e-3 * np.eye(3)
         angles = np.linalg.solve(model.axes[of_base].T, rotations.log(rotations.project(H[None])[0]))
         beyond = np.abs(angles - np.clip(angles, *limits.T)).sum() + abs(bend - allowed)
@@ -202,7 +203,7 @@ def limb_angles(model: Articulated, base: int, middle: int, end: int | None, goa
 
 
 def _bends(axis: np.ndarray, first: np.ndarray, second: np.ndarray, cosine: float) -> np.ndarray:
-    """The two angles of a hinge at which two bones, unit, enclose an angle of the given cosine, or come nearest."""
+    """Compute the two hinge angles at which two unit bones enclose an angle of a given cosine, or come nearest."""
     still = (first @ axis) * (axis @ second)
     a, b = first @ second - still, first @ np.cross(axis, second)
     middle, half = np.arctan2(b, a), np.arccos(np.clip((cosine - still) / max(np.hypot(a, b), 1e-12), -1, 1))

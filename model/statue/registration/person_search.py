@@ -1,4 +1,4 @@
-"""Where and how a person stands in a scan of which neither up nor front is known: the control model brought to it."""
+"""Search for a person who stands in a scan with unknown up and front, by the control model."""
 from __future__ import annotations
 
 from dataclasses import dataclass
@@ -23,11 +23,11 @@ from ...skinning import SkinningModel
 from ..control.model import ControlModel
 from .articulated import Articulated
 
-# standard deviations of how people differ from the control model: in all (share), of single segments (share), and of
-# how far their surface stands off (metres)
+# standard deviations of people around the control model: all lengths (share), single segments (share), and girth as
+# offset of the surface (metres)
 STATURE, LENGTH, GIRTH = 0.12, 0.08, 0.02
-CAP, NORMALS = 0.08, 0.05        # metres: of a distance, and what a difference of normals of one is worth
-# the control model is a coarse one of a body that it does not know: it stays 2 cm off
+CAP, NORMALS = 0.08, 0.05        # metres: largest distance that counts, and weight of a unit difference of normals
+# the control model is coarse and of another body, so it stays 2 cm off
 SETTINGS = ScanFitConfig(scan_sd=0.02, rounds=5, scan_points=1500, model_points=800, random_starts=30)
 
 
@@ -41,7 +41,7 @@ class Stand:
 
 
 def control_body(control: ControlModel) -> SkinningModel:
-    """The control model as a body of unknown shape: a beta for stature, one for each segment's length and girth."""
+    """Build the control model as a body of unknown shape: betas for stature, and each segment's length and girth."""
     model, skeleton = Articulated(control), control.skeleton
     x, (N, J, A, S) = control.mesh.vertices, (*control.weights.shape, len(model.axes), len(model.lengths))
     frames = model.frames(model.rest)
@@ -61,18 +61,18 @@ def control_body(control: ControlModel) -> SkinningModel:
 
 
 def find_stand(control: ControlModel, scan: Mesh | np.ndarray, metres: float) -> list[Stand]:
-    """The best stand in a scan whose unit is so many `metres`, and the best that faces another way."""
+    """Find the best stand in a scan whose unit is `metres`, and the best one that faces another way."""
     body = as_body(control_body(control))
     fit = scan_fit(body, prepare_scan(scan, metres=metres), np.zeros(0, dtype=np.int64), np.zeros((0, 3)), SETTINGS)
-    few = fit.few()
-    x, _ = with_limbs(fit, few, best_starts(few, first_starts(fit, few)))
-    x = solve_jointly(fit, few, x, lambda done: None).x
-    other = approach(few, facing_back(fit, x))
+    coarse = fit.few()
+    x, _ = with_limbs(fit, coarse, best_starts(coarse, first_starts(fit, coarse)))
+    x = solve_jointly(fit, coarse, x, lambda done: None).x
+    other = approach(coarse, facing_back(fit, x))
     return sorted((_stand(fit, one) for one in (x, other)), key=lambda stand: stand.misfit)
 
 
 def facing_back(fit: ScanFit, x: np.ndarray) -> np.ndarray:
-    """Unknowns (P,) of a body that stands where it did, turned half way round about its long axis, limbs at rest."""
+    """Turn a body by half a turn about its long axis, with limbs at rest; return unknowns (P,)."""
     body, out = fit.body, x.copy()
     pose, before = body.pose_mean.copy(), body.vertices(x).mean(axis=0)
     up = np.zeros(3)
@@ -89,7 +89,7 @@ def _stand(fit: ScanFit, x: np.ndarray) -> Stand:
 
 
 def stand_misfit(body: Mesh, points: np.ndarray, normals: np.ndarray) -> tuple[float, float]:
-    """How far apart a body and the points (n, 3) of a scan are: `off` and `misfit` of a `Stand`."""
+    """Measure the distance of a body and scan points (n, 3): `off` and `misfit` of a `Stand`."""
     there = Surface(body).closest(points)
     facing = np.einsum("nd,nd->n", body.face_normals[there.faces], normals)
     off = np.minimum(there.distances**2 + NORMALS**2 * (1 - facing), CAP**2)

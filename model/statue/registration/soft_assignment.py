@@ -1,9 +1,10 @@
-"""Annealed soft assignment of the vertices of a model to points of a scan: to several at once, the nearer ones more.
+"""Annealed soft assignment of the vertices of a model to several points of a scan each, nearer ones with more weight.
 
-The published slack of a point, begun as its smallest match and balanced, takes distance out of the assignment: m_ij
-becomes proportional to exp((d_max² - d_ij²) / T). With `slack="rest"` it is whatever remains and costs nothing: m is
-the minimum of Eq. 15 under Σ_i m_ij <= 1, and tends to the closest points as T goes to 0. Where vertices outnumber
-their points Eq. 14 has no solution: rows come last and sum to 1, `excess` tells by how much a point is assigned twice.
+The published slack of a point begins as its smallest match and is balanced. That removes distance from the assignment:
+m_ij becomes proportional to exp((d_max² - d_ij²) / T). With `slack="rest"` the slack is the remainder and costs
+nothing. Then m is the minimum of Eq. 15 under Σ_i m_ij <= 1, and tends to the closest points as T goes to 0. Where
+vertices outnumber their points, Eq. 14 has no solution. Rows are balanced last and sum to 1; `excess` is how much a
+point is assigned too often.
 
 [Statues] Eq. 13-17
 """
@@ -45,8 +46,9 @@ class DirectedPoints:
         self.spacing = float(np.median(self.tree.query(some, min(5, len(points)))[0][:, -1]))
 
     def nearest(self, x: np.ndarray, normals: np.ndarray, neighbours: int) -> tuple[np.ndarray, np.ndarray]:
-        """The nearest points (I, K) whose normals lie in the half-space of the vertex normal, the nearest first, -1
-        where there are no more; and their squared distances, inf where there are no more.
+        """Find the nearest points (I, K) that face the same way as each vertex, nearest first, and squared distances.
+
+        Where there are no more, the point is -1 and the distance infinite.
         """
         index, squared = self._facing(x, normals, 2 * neighbours)
         alone = np.flatnonzero(index[:, 0] < 0)          # deep inside a limb the other side may be nearer
@@ -56,7 +58,7 @@ class DirectedPoints:
         return index[:, :neighbours], squared[:, :neighbours]
 
     def beside(self, x: np.ndarray, nearest: np.ndarray) -> np.ndarray:
-        """(I,) bool: vertices (I, 3) not beyond the edge of a hole, where their nearest points (I,) say nothing."""
+        """Find vertices (I, 3) that are not beyond the edge of a hole, by their nearest points (I,): (I,) bool."""
         beside = nearest >= 0
         for at in (nearest, self.tree.query(x)[1]):                  # of those that face the same way; of all
             offset = np.cross(self.normals[at], x - self.points[at])
@@ -75,8 +77,10 @@ class DirectedPoints:
 
 def assign_softly(near: np.ndarray, squared: np.ndarray, count: int, temperature: float, slack: Slack = "rest",
                   tolerance: float = 0.01, most: int = 5) -> SoftAssignment:
-    """Balanced soft assignment, at one temperature (m²), of vertices to the points (I, K) that each knows, -1 for none,
-    by their squared distances; done when no share of a point changes by more than `tolerance` of itself.
+    """Balance a soft assignment of vertices to their nearest points (I, K), -1 for none, at one temperature (m²).
+
+    It ends when no share of a point changes by more than `tolerance` of itself.
+
     [Statues] Eq. 14, 17
     """
     known = near >= 0
@@ -87,7 +91,7 @@ def assign_softly(near: np.ndarray, squared: np.ndarray, count: int, temperature
     np.minimum.at(log_s, column, log_k)                  # the smallest match of each point
     u, v = np.zeros(len(near)), np.zeros(len(used))
     for _ in range(most):
-        # Rows first, with logarithms; then plain factors, which are fast, for as long as they are no extreme numbers.
+        # rows first, by logarithms; then plain factors, which are faster, until they become extreme
         top = np.full(len(near), -np.inf)
         np.maximum.at(top, row, log_k + v[column])
         u = -np.where(np.isfinite(top), top, 0.0)
@@ -104,8 +108,9 @@ def assign_softly(near: np.ndarray, squared: np.ndarray, count: int, temperature
 
 def _balance(M: csr_array, most: np.ndarray | None, log_s: np.ndarray, tolerance: float, rounds: int = 20
              ) -> tuple[np.ndarray, np.ndarray, float]:
-    """Factors of rows (I,) and columns (J,), rows last, and the largest relative change in the last round. Columns come
-    to 1 together with a slack of exp(log_s); or at most to 1, by factors of at most `most`.
+    """Balance rows and columns: factors (I,) and (J,), rows last, and the largest relative change in the last round.
+
+    Columns sum to 1 together with a slack of exp(log_s), or to at most 1 by factors of at most `most`.
     """
     T = csr_array(M.T)
     empty = np.diff(M.indptr) == 0

@@ -1,7 +1,7 @@
 """Fit of a control mesh to a scan: a shape-constrained deformable surface under annealed soft assignment.
 
-Beyond the paper, points of the scan draw the mesh as well (`cover`), at the end vertices are drawn to the surface
-between the points (`polish`), and at the edge of a hole the data draw only across the surface.
+Beyond the paper, points of the scan attract the mesh as well (`cover`), and at the end vertices are attracted to the
+surface between the points (`polish`). At the edge of a hole the data act only across the surface.
 
 [Statues] section 4
 """
@@ -66,9 +66,9 @@ class SurfaceFitConfig(Settings):
 
     @classmethod
     def from_paper(cls) -> SurfaceFitConfig:
-        """As the paper has it; cooling and steps, which it does not tell, are such that the Euler steps converge.
+        """Return the paper's settings; cooling and steps, which it does not name, let the Euler steps converge.
 
-        Not as in the paper: vertices past the edge of a hole of the scan are carried by the shape.
+        Not as in the paper: the shape carries vertices past the edge of a hole of the scan.
         """
         return cls(step="explicit", slack="published", cover=0.0, polish=0, cooling=0.7, most=100, reach=10.0)
 
@@ -140,7 +140,7 @@ def fit_surface(rest: Mesh, start: np.ndarray, scan: Mesh, config: SurfaceFitCon
 
 
 class _Fit:
-    """What a fit of vertices x (N, 3) goes by, and its steps."""
+    """The data of a surface fit of vertices x (N, 3), and its steps."""
 
     def __init__(self, rest: Mesh, start: np.ndarray, scan: Mesh, config: SurfaceFitConfig, hidden: np.ndarray | None
                  ) -> None:
@@ -149,17 +149,17 @@ class _Fit:
         self.shape = local_shape(rest)
         self.points = DirectedPoints(target.points, target.normals, target.border)
         self.stiffness = csc_array(self.shape.plane.T @ diags_array(self.shape.weights) @ self.shape.plane)
-        # ten points of the scan for each vertex draw the mesh
+        # ten points of the scan for each vertex attract the mesh
         self.sample = target.thin(max(float(np.sqrt(float(scan.face_areas.sum()) / (10 * len(start)))), 1e-4))
         self.shown = np.ones(len(start), dtype=bool) if hidden is None else ~np.asarray(hidden)
         self.reach = config.reach * float(np.sqrt(rest.with_vertices(start).face_areas.sum()))
 
     def normals(self, x: np.ndarray) -> np.ndarray:
-        """(N, 3) of the vertices."""
+        """Compute the normals (N, 3) of the vertices."""
         return self.rest.with_vertices(x).vertex_normals
 
     def schedule(self, x: np.ndarray) -> np.ndarray:
-        """Temperatures (K,), from the largest squared distance of a vertex to its nearest point down to (1 mm)²."""
+        """Compute temperatures (K,), from the largest squared distance of a vertex to its point down to (1 mm)²."""
         final = 0.001**2
         near, squared = self.points.nearest(x, self.normals(x), 1)
         first = max(float(squared[self.beside_data(x, near[:, 0]), 0].max(initial=0.0)), final)
@@ -167,7 +167,7 @@ class _Fit:
         return np.geomspace(first, final, stages)
 
     def anneal(self, x: np.ndarray, T: float, most: int) -> tuple[np.ndarray, bool]:
-        """Vertices after steps at one temperature, until the gradient lies within the region of matching, or not."""
+        """Take steps at one temperature until the gradient is below √T; return vertices and whether it converged."""
         explicit, lam = self.config.step == "explicit", self.config.shape
         for count in range(most + 1):
             matches, A = self.assignment(x, T)                                             # [Statues] Eq. 14, 15, 17
@@ -181,9 +181,10 @@ class _Fit:
         return x, converged
 
     def assignment(self, x: np.ndarray, T: float) -> tuple[csr_array, np.ndarray]:
-        """The balanced matches, and (N, 3, 3) what they weigh: nothing without data, at borders only across them.
+        """Assign vertices to points; return the balanced matches and their weights (N, 3, 3).
 
-        At the edge of a hole all points lie to one side: their mean would draw the mesh off the hole.
+        The weight is zero without data. At the edge of a hole all points lie to one side, and their mean would pull the
+        mesh off the hole; so there it acts only along the normal.
         """
         near, squared = self.points.nearest(x, self.normals(x), self.config.neighbours)
         near[~self.beside_data(x, near[:, 0])] = -1
@@ -194,21 +195,21 @@ class _Fit:
         return found.matches, found.seen[:, None, None] * A
 
     def beside_data(self, x: np.ndarray, nearest: np.ndarray) -> np.ndarray:
-        """(N,) bool: shown, within reach of the nearest point, not past the edge of a hole where it says nothing."""
+        """Find vertices with data, (N,) bool: shown, near their nearest point, not past the edge of a hole."""
         near = np.linalg.norm(self.points.points[nearest] - x, axis=1) <= self.reach
         return self.shown & near & self.points.beside(x, nearest)
 
     def find_data(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Vertices with data (N,), and the nearest point (N,) of the whole scan."""
+        """Find vertices with data (N,), and the nearest point (N,) of the whole scan."""
         nearest = self.points.nearest(x, self.normals(x), 1)[0][:, 0]
         return self.beside_data(x, nearest), nearest
 
     def undrawn(self, A: np.ndarray, wanted: np.ndarray) -> SurfaceData:
-        """The data term that draws vertices to `wanted` (N, 3) by A (N, 3, 3) alone."""
+        """Build the data term that attracts vertices to `wanted` (N, 3) with weights A (N, 3, 3) alone."""
         return SurfaceData(A, wanted, csc_array((0, len(wanted))), np.zeros((0, 3)), 0.0)
 
     def find_matches(self, x: np.ndarray, A: np.ndarray, wanted: np.ndarray) -> SurfaceData:
-        """The same, and points of the scan draw the mesh where both face the same way."""
+        """Build the data term in which scan points also attract the mesh, where both face the same way."""
         if not self.config.cover:
             return self.undrawn(A, wanted)
         mesh = self.rest.with_vertices(x)
@@ -222,7 +223,8 @@ class _Fit:
         return SurfaceData(A, wanted, C, self.sample.points[good], self.config.cover * len(x) / len(found.faces))
 
     def step(self, x: np.ndarray, data: SurfaceData, force: np.ndarray) -> np.ndarray:
-        """Vertices after a Gauss-Newton step on local shape and data; `force` is minus half the gradient."""
+        """Take a Gauss-Newton step on local shape and data; `force` is minus half the gradient."""
+        # conjugate gradients on the exact matrix, preconditioned by one that is the same for all coordinates
         shape, w, lam = self.shape, self.shape.weights[:, None], self.config.shape
         nearly = Factored(csc_array(lam * self.stiffness + data.bound + 1e-6 * lam * eye_array(len(x))))
         d = conjugate_gradients(lambda d: lam * shape.apply_transpose(x, w * shape.derivative(x, d)) + data.apply(d),
@@ -237,7 +239,7 @@ class _Fit:
         return x + length * d
 
     def polish(self, x: np.ndarray) -> np.ndarray:
-        """Vertices after a round in which they are drawn to the tangent planes of the surface itself."""
+        """Take a step in which vertices are attracted to the tangent planes of the surface itself."""
         seen, near = self.find_data(x)
         found, n = self.surface.closest(x), self.target.normals[near]
         wrong = np.einsum("nd,nd->n", self.surface.mesh.face_normals[found.faces], self.normals(x)) <= 0
@@ -247,7 +249,7 @@ class _Fit:
         return self.step(x, data, data.force(x) - 0.5 * self.config.shape * self.shape.gradient(x))
 
     def onto_the_surface(self, x: np.ndarray) -> np.ndarray:
-        """Vertices with data moved onto the surface, where that inverts no triangle."""
+        """Move vertices with data onto the surface, where that inverts no triangle."""
         x = unfold(self.rest, x)
         free, _ = self.find_data(x)
         found = self.surface.closest(x)
@@ -264,7 +266,7 @@ class _Fit:
 
 @dataclass(frozen=True, eq=False)
 class SurfaceData:
-    """A data term Σ (x - y)ᵀ A (x - y) + share · |C x - z|²: vertices are drawn, and points of the scan draw the mesh.
+    """A data term Σ (x - y)ᵀ A (x - y) + share · |C x - z|²: targets of vertices, and scan points that attract them.
 
     [Statues] Eq. 13
     """
@@ -276,26 +278,26 @@ class SurfaceData:
     share: float   # weight of each of these
 
     def energy(self, x: np.ndarray) -> float:
-        """At vertices x (N, 3), square metres."""
+        """Compute the energy at vertices x (N, 3), square metres."""
         return float(np.einsum("ni,nij,nj->", x - self.y, self.A, x - self.y)
                      + self.share * ((self.C @ x - self.z) ** 2).sum())
 
     def force(self, x: np.ndarray) -> np.ndarray:
-        """(N, 3) minus half the gradient."""
+        """Compute minus half the gradient (N, 3)."""
         return np.einsum("nij,nj->ni", self.A, self.y - x) + self.share * (self.C.T @ (self.z - self.C @ x))
 
     def apply(self, d: np.ndarray) -> np.ndarray:
-        """(N, 3) half the second derivative, applied to d (N, 3)."""
+        """Apply half the second derivative to d (N, 3)."""
         return np.einsum("nij,nj->ni", self.A, d) + self.share * (self.C.T @ (self.C @ d))
 
     @property
     def bound(self) -> csc_array:
-        """(N, N) the same for each coordinate, at least as stiff."""
+        """(N, N) an upper bound of half the second derivative, the same for each coordinate."""
         return csc_array(diags_array(np.linalg.eigvalsh(self.A)[:, 2]) + self.share * (self.C.T @ self.C))
 
 
 def scan_target(scan: Mesh) -> Target:
-    """Points with smooth normals; the borders are those of the mesh, for tips of limbs look one-sided as well."""
+    """Prepare scan points with smooth normals; borders are those of the mesh, as tips of limbs look one-sided too."""
     border = np.zeros(len(scan.vertices), dtype=bool)
     border[scan.boundary_vertices] = True
     border |= scan.vertex_adjacency @ border.astype(float) > 0       # the nearest point may lie one step farther in
