@@ -48,7 +48,7 @@ def load_model(path: str | Path) -> BodyModel:
         module, name = LOADERS[str(path)]
         load: Callable[[], BodyModel] = getattr(importlib.import_module(module), name)
         return load()
-    kind = storage.stored_kind(path)
+    kind = storage.kind_of_stored(path)
     if kind not in KINDS:
         raise storage.StorageError(f"{path}: expected a body model of kind {', '.join(KINDS)}, found '{kind}'")
     module, name = KINDS[kind]

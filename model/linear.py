@@ -116,6 +116,7 @@ class PointOperator(SurfaceCombination):
         if pose.ndim == 2:
             y, columns = self.columns(pose, trans)
             return y, np.moveaxis(columns, (0, 1), (-1, -2))
+        # a batch goes in pieces; each piece turns from coordinates first to points first
         B, J, L = len(pose), len(self.skeleton.parents), self.count
         y, d_pose = np.empty((B, L, 3)), np.empty((B, L, 3, 3 * J))
         step = self._at_once(3 * L)

@@ -36,7 +36,7 @@ def rotation_matrices(twist: Tensor) -> Tensor:
 
     Examples
     --------
-    >>> rotation_matrices(torch.tensor([0.0, 0.0, torch.pi / 2])).round().tolist()
+    >>> (rotation_matrices(torch.tensor([0.0, 0.0, torch.pi / 2])).round() + 0.0).tolist()
     [[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]
     """
     square = (twist * twist).sum(-1)[..., None, None]

@@ -20,7 +20,7 @@ from completion.motion import Motion
 from completion.partial.completion import Completion, load_completion, save_completion
 from completion.partial.masks import read_mask
 from model.export.bvh import write_bvh
-from model.files import KINDS as known_kinds
+from model.files import KINDS as known_kinds  # noqa: N811
 from model.files import load_model
 from model.learning.cli import _read_sexes
 from model.motion.bvh import read_bvh
@@ -267,7 +267,7 @@ def _add_sets(rng: np.random.Generator, place: Any, add: Any, text: Any) -> None
     source, config = filled(place("source")), DecimateSetConfig(meshes=1)
     write_decimated_set(source, place("small"), 60, config)
     add(place("small") / "decimation.npz", lambda path: _load_map(
-        path, source, config, {k: storage.stored_kind(path) and v for k, v in _settings(path).items()}),
+        path, source, config, {k: storage.kind_of_stored(path) and v for k, v in _settings(path).items()}),
         lambda found: good_mesh(found.template))
     write_correspondences(path := place("pairs.json"), Correspondences(
         np.arange(4), rng.random((4, 3)), np.ones(4), "manual", {"all": float("nan")}, True))

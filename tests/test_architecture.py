@@ -142,7 +142,7 @@ def test_top_level_is_as_agreed():
     top = {line.split("/")[0] for line in listed.stdout.splitlines()}
     visible = {entry for entry in top if not entry.startswith(".")}
     assert visible == {"pyproject.toml", "README.md", "scanprep", "model", "completion", "tests", "LICENSE",
-                       "NOTICE", "CHANGELOG.md"}
+                       "NOTICE", "CHANGELOG.md", "CITATION.cff"}
     assert not list((ROOT / "tests").rglob("__init__.py"))
     assert not list(ROOT.glob("*/utils.py"))
 

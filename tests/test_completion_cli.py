@@ -30,7 +30,7 @@ def small_pictures():
     """Nobody looks at them here."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(report, "HEIGHT", 60)
-        patch.setattr(textures.bake_texture, "__defaults__", (256,))
+        patch.setattr(textures.bake_body_texture, "__defaults__", (256,))
         yield
 
 

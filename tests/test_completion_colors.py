@@ -10,7 +10,7 @@ from scanprep.geometry.files import PointCloud
 from scanprep.geometry.format_glb import tallest, turn_up
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.surface import Surface
-from scanprep.pictures.textures import Texture, bake_texture, read_texture, write_textured
+from scanprep.pictures.textures import Texture, bake_body_texture, read_texture, write_textured
 from scanprep.synthetic.people import SyntheticPerson
 from scanprep.synthetic.scanner import ScannerConfig, scan
 
@@ -163,7 +163,7 @@ def test_a_baked_texture_shows_the_colours_of_the_scan(person, views):
         np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1)
         return np.clip(paint(places), 0, 1), (places[:, 0] > 0).astype(float)
 
-    texture = bake_texture(head, look, plain, 256)
+    texture = bake_body_texture(head, look, plain, 256)
     corners = np.tile(0.8 * np.eye(3) + 0.2 / 3, (len(head.faces), 1))
     faces = np.repeat(np.arange(len(head.faces)), 3)
     at = np.einsum("nc,ncd->nd", corners, head.corners[faces])

@@ -131,9 +131,9 @@ def test_numpys_advice_to_allow_pickles_reaches_nobody(tmp_path):
     (tmp_path / "pickle.npz").write_bytes(pickle.dumps({"poses": 1}))
     (tmp_path / "long.npz").write_bytes(npz(poses=npy(" " * 20_000 + "(1,)")))
     for name in ("objects.npz", "pickle.npz", "long.npz"):
-        for read in (Motion.load, load_model, storage.load_arrays, storage.stored_kind):
-            if (name, read) == ("objects.npz", storage.stored_kind) or (name, read) == ("long.npz",
-                                                                                        storage.stored_kind):
+        for read in (Motion.load, load_model, storage.load_arrays, storage.kind_of_stored):
+            if (name, read) == ("objects.npz", storage.kind_of_stored) or (name, read) == ("long.npz",
+                                                                                           storage.kind_of_stored):
                 continue
             with pytest.raises(storage.StorageError, match=name) as caught:
                 read(tmp_path / name)

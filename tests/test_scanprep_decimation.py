@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from scanned_shapes import SIX, bumpy, triangle_quality, view
 
-from scanprep.adapters.open3d_filters import MissingLibrary
+from scanprep.adapters.open3d_filters import MissingLibraryError
 from scanprep.decimation import edge_collapse
 from scanprep.decimation.decimate import DecimateConfig, collapse, decimate, fast_collapses
 from scanprep.decimation.quadrics import minimise_quadrics, plane_quadrics, point_quadrics, surface_quadrics, value
@@ -224,7 +224,8 @@ def test_other_libraries_as_settings(library):
 @pytest.mark.parametrize("library", ["open3d", "pymeshlab"])
 def test_a_missing_library_is_named(library, monkeypatch):
     monkeypatch.setitem(__import__("sys").modules, library, None)
-    with pytest.raises(MissingLibrary, match=f"{library} cannot be imported.*libegl1 libgl1 libx11-6 libusb-1.0-0"):
+    with pytest.raises(MissingLibraryError,
+                       match=f"{library} cannot be imported.*libegl1 libgl1 libx11-6 libusb-1.0-0"):
         decimate(bumpy(3), 100, DecimateConfig(library))
 
 

@@ -8,7 +8,7 @@ from scanprep.judgement import size
 from scanprep.pipeline.scan import size_doubts
 from scanprep.registration import unmarked
 from scanprep.registration.limb_ends import RigidFit, bending, find_ends, rotate_ends
-from scanprep.registration.limbs import anatomical_angles, frames, limb_doubts, part_bending, rolls
+from scanprep.registration.limbs import frames, limb_doubts, part_angles, part_bending, rolls
 from scanprep.registration.nonrigid import Registration
 from scanprep.registration.person import PersonParts, average_person
 from scanprep.skeleton.tree import Skeleton
@@ -43,7 +43,7 @@ def test_angles_are_those_that_a_joint_was_given(person):
     pose = np.zeros((len(PARTS), 3))
     forearm, shin = PARTS.index("forearm_left"), PARTS.index("shin_right")
     pose[forearm], pose[shin] = np.radians(40) * frames()[forearm, 1], np.radians(-25) * frames()[shin, 0]
-    angles = anatomical_angles(person.part_rotations(pose))
+    angles = part_angles(person.part_rotations(pose))
     wanted = np.zeros((len(PARTS), 3))
     wanted[forearm, 1], wanted[shin, 0] = 40, -25
     assert np.allclose(angles, wanted, atol=1e-9)

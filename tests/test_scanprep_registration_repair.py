@@ -10,7 +10,7 @@ from scanprep.geometry.surface import Surface
 from scanprep.registration import person as person_module
 from scanprep.registration.deformation_graph import build_graph, deform, motion_of
 from scanprep.registration.graph_fit import start_fit
-from scanprep.registration.limbs import anatomical_angles, angle_excess, find_exchanged_sides, frames, limb_doubts
+from scanprep.registration.limbs import angle_excess, find_exchanged_sides, frames, limb_doubts, part_angles
 from scanprep.registration.matches import prepare_problem
 from scanprep.registration.nonrigid import Registration, measure_fit
 from scanprep.registration.person import PersonParts, average_person, person_parts
@@ -86,7 +86,7 @@ def test_a_rolled_limb_is_asked_to_roll_back(person, parts, part, angle):
     assert set(np.flatnonzero(first)) <= set(touched) & set(LIMBS)
     assert np.cos(first[part] + np.radians(angle)) > 0.2             # joints leave some play
     back = np.stack([R[p] @ rotations.exp(first[p] * frames()[p, 0]) for p in range(len(PARTS))])
-    assert angle_excess(anatomical_angles(R)).max() > 40 and angle_excess(anatomical_angles(back)).max() < 5   # degrees
+    assert angle_excess(part_angles(R)).max() > 40 and angle_excess(part_angles(back)).max() < 5   # degrees
 
 
 def test_where_no_joint_tells_a_doubted_limb_is_turned_by_quarters(person, parts):

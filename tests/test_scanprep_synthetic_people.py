@@ -14,7 +14,7 @@ from model.measurement.measure import measure
 from model.measurement.survey import survey
 from scanprep.geometry import rotations
 from scanprep.geometry.mesh import Mesh, template_problem
-from scanprep.registration.limbs import anatomical_angles, angle_excess
+from scanprep.registration.limbs import angle_excess, part_angles
 from scanprep.synthetic import people, topology
 from scanprep.synthetic.data_set import subject_pose
 from scanprep.synthetic.landmarks import landmarks
@@ -320,4 +320,4 @@ def test_the_poses_of_the_demonstration_are_ones_that_people_do(man):
     """No limb lies so that its registration would be doubted, whatever the seed."""
     poses = [subject_pose(k, np.random.default_rng([seed, 1, k]))[1] for seed in range(6) for k in range(1, 12)]
     bodies = np.stack([man.in_pose(pose) for pose in poses])
-    assert not angle_excess(anatomical_angles(man.skeleton.fit_rotations(man.mesh, bodies))).any()
+    assert not angle_excess(part_angles(man.skeleton.fit_rotations(man.mesh, bodies))).any()

@@ -377,12 +377,12 @@ def load_completion(folder: str | Path) -> Completion:
 
     Examples
     --------
-    >>> from tempfile import mkdtemp
+    >>> from completion.partial.completion import save_completion
     >>> from scanprep.synthetic.topology import load_topology
     >>> mesh = load_topology().mesh
     >>> seen = np.ones(len(mesh.vertices), dtype=bool)
     >>> result = Completion(mesh, mesh, np.zeros((16, 3)), None, np.zeros(3), seen, 0.001, 0.98, 0.004, True, 12)
-    >>> load_completion(save_completion(mkdtemp(), result)).iterations
+    >>> load_completion(save_completion("completed", result)).iterations
     12
 
     [SCAPE] §7

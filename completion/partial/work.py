@@ -24,7 +24,7 @@ from scanprep.geometry.mesh import Mesh
 from scanprep.judgement import size
 from scanprep.pictures.scene import SCENE, small_scene
 from scanprep.pictures.sheets import save_png
-from scanprep.pictures.textures import Texture, bake_texture, read_texture, write_textured
+from scanprep.pictures.textures import Texture, bake_body_texture, read_texture, write_textured
 from scanprep.registration.ground import soles_row
 
 from .clicked_markers import extra_markers, write_clicked_markers
@@ -122,7 +122,7 @@ def write_results(work: CompletionTask, inputs: CompletionInputs, files: ScanFil
         colors = carry_colors(mesh, done.seen, views, work.colors, viewpoint, done.scale, files.textures)
         if any(texture is not None for texture in files.textures):
             known = views_with_colors(views, viewpoint, done.scale, files.textures)
-            write_textured(output / "completed.glb", bake_texture(
+            write_textured(output / "completed.glb", bake_body_texture(
                 mesh, lambda places, normals: blend(known, places, normals, work.colors), colors))
         done = replace(done, completed=Mesh(mesh.vertices, mesh.faces, colors))
     save_completion(output, done)

@@ -25,7 +25,7 @@ def viewable_kind(path: Path) -> str:
         names = storage.names_in(path, "a model or a motion")
         if storage.HEADER not in names:
             return "motion" if is_motion(path) else f"an archive of {', '.join(sorted(names)) or 'nothing'}"[:100]
-        kind = storage.stored_kind(path)
+        kind = storage.kind_of_stored(path)
         return "model" if kind in KINDS else kind if kind == "completion" else f"a file of kind '{kind}'"
     suffix = path.suffix.lower()
     if suffix == ".bvh":

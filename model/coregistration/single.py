@@ -16,7 +16,7 @@ from scanprep.threads import one_thread
 from ..body import BodyModel
 from ..features import twists
 from ..fitting.bodies import FixedBody, as_body
-from ..fitting.limbs import misplaced_limbs, reinitialise_limbs, with_limbs
+from ..fitting.limbs import find_misplaced_limbs, reinitialise_limbs, with_limbs
 from ..fitting.rounds import meet_vertices, solve_jointly
 from ..fitting.scan_fit import ScanFit, prepare_scan_fit
 from ..fitting.starts import best_starts, first_starts
@@ -175,7 +175,7 @@ def _pose_and_shape(fit: ScanFit, given: np.ndarray | None) -> tuple[np.ndarray,
         best, tried = reinitialise_limbs(coarse, best_starts(coarse, given)[0]), 1
     # a given start that explains 98% of the scan and has no misplaced limb is enough
     explains = best is not None and coarse.find_unexplained(best, coarse.thin).mean() <= 1 - 0.98
-    if best is None or not explains or misplaced_limbs(coarse, best):
+    if best is None or not explains or find_misplaced_limbs(coarse, best):
         starts = first_starts(fit, coarse)
         tried += len(starts)
         other = with_limbs(fit, coarse, best_starts(coarse, starts))[0]

@@ -40,7 +40,7 @@ def with_limbs(fit: ScanFit, coarse: ScanFit, starts: np.ndarray) -> tuple[np.nd
     for x in starts[1:]:
         both = len(ends) == 1 and fit.cloud.person is not None and not len(fit.vertices)
         # an energy of 100, three times that of a misplaced limb: the whole body may be wrong
-        if not both and not misplaced_limbs(coarse, min(ends, key=coarse.misfit), 100.0):
+        if not both and not find_misplaced_limbs(coarse, min(ends, key=coarse.misfit), 100.0):
             break
         ends.append(reinitialise_limbs(coarse, x))
     if len(ends) == 1:
@@ -58,13 +58,13 @@ def reinitialise_limbs(fit: ScanFit, x: np.ndarray) -> np.ndarray:
     The worst limb comes first. After a limb was moved the others are judged again, since it may now explain points that
     they could have explained.
     """
-    if not misplaced_limbs(fit, x):
+    if not find_misplaced_limbs(fit, x):
         return x
     free, held = fit.body.n_angles + 3, fit.fix_shape(x)
     moved = approach(held, x[:free], REACHES)
     tried: list[list[int]] = []                      # limbs that were tried without success on the present body
     for _ in range(ROUNDS * len(limb_runs(fit.body.skeleton))):
-        limb = next((limb for limb in misplaced_limbs(held, moved) if limb not in tried), None)
+        limb = next((limb for limb in find_misplaced_limbs(held, moved) if limb not in tried), None)
         if limb is None:
             break
         before, moved = moved, _reinitialise(held, moved, limb)
@@ -72,7 +72,7 @@ def reinitialise_limbs(fit: ScanFit, x: np.ndarray) -> np.ndarray:
     return np.concatenate([moved, x[free:]])
 
 
-def misplaced_limbs(fit: ScanFit, x: np.ndarray, least: float = AMISS) -> list[list[int]]:
+def find_misplaced_limbs(fit: ScanFit, x: np.ndarray, least: float = AMISS) -> list[list[int]]:
     """List misplaced limbs, worst first; a limb is a list of parts.
 
     Misplaced limbs violate space, or could explain scan points that nothing explains.

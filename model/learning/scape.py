@@ -141,8 +141,22 @@ def learn_blendscape(template: Mesh, poses: np.ndarray, shapes: np.ndarray | Non
 
     Parameters
     ----------
-    template, poses, shapes, skeleton, config, progress, step, prior
-        As for `learn_scape`.
+    template : Mesh
+        The rest pose, as for `learn_scape`.
+    poses : (M, N, 3) float, metres
+        One person in many poses.
+    shapes : (S, N, 3) float, metres, or None
+        Many people in about one pose.
+    skeleton : Skeleton
+        Parts and joints of the template.
+    config : LearnConfig, optional
+        Settings.
+    progress : callable, optional
+        Called with (done, total).
+    step : callable, optional
+        Keeps intermediate results, as for `learn_scape`.
+    prior : TemplatePrior, optional
+        A known model that few bodies lean on.
 
     Returns
     -------

@@ -68,10 +68,20 @@ def learn_skinning(template: Mesh, poses: np.ndarray, shapes: np.ndarray | None,
 
     Parameters
     ----------
-    template, poses, shapes, skeleton, progress, step
-        As for `learn_scape`; joints are fitted near those of the skeleton.
+    template : Mesh
+        The rest pose.
+    poses : (M, N, 3) float, metres
+        One person in many poses.
+    shapes : (S, N, 3) float, metres, or None
+        Many people in about one pose.
+    skeleton : Skeleton
+        Joints are fitted near those of the skeleton.
     config : SkinConfig, optional
         Settings.
+    progress : callable, optional
+        Called with (done, total).
+    step : callable, optional
+        Keeps intermediate results, as for `learn_scape`.
 
     Returns
     -------

@@ -49,7 +49,7 @@ def read_bvh(path: str | Path, unit: str, rate: float | None = None) -> MovingSk
 
     Examples
     --------
-    >>> import tempfile
+    >>> from pathlib import Path
     >>> text = '''HIERARCHY
     ... ROOT Hips
     ... { OFFSET 0 90 0 CHANNELS 6 Xposition Yposition Zposition Zrotation Xrotation Yrotation
@@ -59,9 +59,8 @@ def read_bvh(path: str | Path, unit: str, rate: float | None = None) -> MovingSk
     ... Frame Time: 0.04
     ... 0 90 0 0 0 0
     ... '''
-    >>> with tempfile.TemporaryDirectory() as folder:
-    ...     _ = Path(f"{folder}/stand.bvh").write_text(text)
-    ...     read_bvh(f"{folder}/stand.bvh", "cm")
+    >>> _ = Path("stand.bvh").write_text(text)
+    >>> read_bvh("stand.bvh", "cm")
     MovingSkeleton(1 joints, 1 frames at 25 1/s)
     """
     # hierarchy, then the table of channels, then rotations and positions by forward kinematics

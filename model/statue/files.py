@@ -91,13 +91,12 @@ def load_statue(folder: str | Path, edited: str | Path | None = None) -> Statue:
 
     Examples
     --------
-    >>> try:
-    ...     load_statue("no such folder")
-    ... except storage.StorageError as error:
-    ...     print(type(error).__name__)
-    StorageError
-
-    [Statues]
+    >>> from model.statue.control.files import humanoid
+    >>> from model.statue.control.model import MEASURED, DisplacementMap
+    >>> flat = DisplacementMap(np.zeros((16, 16), np.float32), np.full((16, 16), MEASURED, np.uint8))
+    >>> save_statue("statue", Statue(humanoid(), np.zeros((len(humanoid().skeleton.parents), 3)), flat))
+    >>> load_statue("statue").map.heights.shape
+    (16, 16)
     """
     from PIL import Image
 

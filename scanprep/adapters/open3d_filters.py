@@ -10,7 +10,7 @@ from ..geometry.mesh import Mesh
 from ..geometry.surface import Surface
 
 
-class MissingLibrary(ImportError):
+class MissingLibraryError(ImportError):
     """A library that a setting asks for, or a system library it needs, is missing."""
 
 
@@ -77,5 +77,6 @@ def library(name: str) -> Any:
     try:
         return importlib.import_module(name)
     except (ImportError, OSError) as error:
-        raise MissingLibrary(f"{name} cannot be imported ({error}). Install it with `pip install {name}`; on Debian it "
-                             "also needs `apt-get install libegl1 libgl1 libx11-6 libusb-1.0-0`") from None
+        raise MissingLibraryError(
+            f"{name} cannot be imported ({error}). Install it with `pip install {name}`; on Debian it also needs "
+            "`apt-get install libegl1 libgl1 libx11-6 libusb-1.0-0`") from None

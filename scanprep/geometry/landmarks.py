@@ -98,6 +98,7 @@ def read_landmark_vertices(path: str | Path, mesh: Mesh, unit: str | None = None
     points = {name: _place(path, name, value, mesh) for name, value in entries.items()}
     check_on_surface(path, {name: points[name] for name, value in entries.items() if isinstance(value, np.ndarray)},
                      mesh.vertices)
+    # a vertex as it is, of a face the nearest corner, of coordinates the nearest vertex
     out = {}
     for name, value in entries.items():
         if isinstance(value, int):
@@ -179,6 +180,7 @@ def write_landmarks(path: str | Path, landmarks: Mapping[str, np.ndarray | int |
         if point.shape != (3,) or not np.isfinite(point).all():
             raise ValueError(f"landmarks: '{name}' expected three finite numbers or a vertex, got {value}")
         out[name] = point
+    # formats of other programs hold points only; JSON of ours holds vertices and points of faces too
     points = {name: value for name, value in out.items() if isinstance(value, np.ndarray)}
     data = encode_landmarks(Path(path).name, points, unit)
     if data is None:

@@ -241,7 +241,7 @@ def load_array(path: str | Path) -> np.ndarray:
         return _array(stream, os.fstat(stream.fileno()).st_size, "")
 
 
-def stored_kind(path: str | Path) -> str:
+def kind_of_stored(path: str | Path) -> str:
     """Read the kind of a file of `save` from its header; StorageError without one."""
     return str(load_header(path, "scapekit").get("kind"))
 

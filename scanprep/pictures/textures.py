@@ -155,7 +155,7 @@ def _beside(path: Path) -> Any:
     return Beside()
 
 
-def bake_texture(body: Mesh, look: Look, unseen: np.ndarray, size: int = 1024) -> Texture:
+def bake_body_texture(body: Mesh, look: Look, unseen: np.ndarray, size: int = 1024) -> Texture:
     """Bake a texture of a body.
 
     Parameters

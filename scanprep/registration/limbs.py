@@ -126,7 +126,7 @@ def find_exchanged_sides(template: Mesh, parts: PersonParts, vertices: np.ndarra
 
 def limb_measures(template: Mesh, parts: PersonParts, vertices: np.ndarray) -> LimbMeasures:
     """Measure joint angles and skin bending of a registration, vertices (N, 3), metres, with their limits."""
-    angles = anatomical_angles(parts.skeleton.fit_rotations(template, vertices) @ parts.R_template_rest)
+    angles = part_angles(parts.skeleton.fit_rotations(template, vertices) @ parts.R_template_rest)
     bending, growth = part_bending(template, parts.skeleton, vertices)
     shape = np.array([SHAPE[part_kind(part)] for part in PARTS])
     most = (people_do()[2] + shape) * size(template.with_vertices(vertices))
@@ -146,7 +146,7 @@ def angle_limits() -> tuple[np.ndarray, np.ndarray]:
     return low - slack, high + slack
 
 
-def anatomical_angles(R: np.ndarray) -> np.ndarray:
+def part_angles(R: np.ndarray) -> np.ndarray:
     """Compute roll, bend and sideways bend (..., 16, 3), degrees, of every part against its parent; 0 for the root.
 
     World rotations R (..., 16, 3, 3) are from the rest pose of the synthetic people. The relative rotation is split
@@ -216,7 +216,7 @@ def people_do() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     # sixty random poses beside the named ones cover the range of motion
     poses = [*map(find_pose, NAMED_POSES), *(random_pose(rng) for _ in range(60))]
     bodies = np.stack([person.in_pose(pose) for pose in poses])
-    angles = anatomical_angles(person.skeleton.fit_rotations(person.mesh, bodies))
+    angles = part_angles(person.skeleton.fit_rotations(person.mesh, bodies))
     bent = np.stack([part_bending(person.mesh, person.skeleton, body)[0] for body in bodies])
     # add the mirrored poses: roll and sideways bend change sign
     angles = np.concatenate([angles, angles[:, MIRROR_PART] * [-1, 1, -1]])

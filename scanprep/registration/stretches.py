@@ -21,7 +21,7 @@ class Field:
 
     R: np.ndarray
     S: np.ndarray
-    log_S: np.ndarray
+    log_S: np.ndarray  # noqa: N815 -- the symbol of the text
 
     @cached_property
     def gradient(self) -> np.ndarray:

@@ -80,11 +80,11 @@ def population() -> Population:
     weights = a["weights"].astype(np.float64)
     weights += weights[mirror][:, swap]
 
-    def named_vertices(kind: str) -> dict[str, int]:
+    def vertices_by_name(kind: str) -> dict[str, int]:
         """Return name -> vertex."""
         return {str(name): int(v) for name, v in zip(a[kind], a[f"{kind}_vertices"], strict=True)}
 
     return Population(mean, directions, a["faces"].astype(np.int64),
                       weights / weights.sum(axis=1, keepdims=True), mirror,
                       {sex: (a[f"{sex}_mean"], a[f"{sex}_covariance"]) for sex in ("female", "male")},
-                      named_vertices("landmarks"), named_vertices("markers"), header)
+                      vertices_by_name("landmarks"), vertices_by_name("markers"), header)

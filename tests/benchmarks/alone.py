@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any
 
 
-class Missing(Exception):
+class MissingError(Exception):
     """A tool that is not installed."""
 
 

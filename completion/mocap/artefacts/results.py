@@ -177,11 +177,11 @@ def write_virtual(path: str | Path, artefacts: MarkerArtefacts, original: str | 
 
     Examples
     --------
-    >>> from tempfile import mkdtemp
+    >>> from completion.mocap.artefacts.results import MarkerArtefacts
     >>> still = MarkerSequence(np.zeros((3, 2, 3)) + 0.5, ("C7", "T10"), 120.0)
     >>> places = still.positions
     >>> clean = MarkerArtefacts((), (), places, still.labels, still, np.ones((3, 2)), places, np.tile([0, 1], (3, 1)))
-    >>> write_virtual(mkdtemp() + "/virtual.csv", clean)
+    >>> write_virtual("virtual.csv", clean)
 
     [MoSh]
     """

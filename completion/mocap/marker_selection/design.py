@@ -133,6 +133,7 @@ def design_markers(model: BodyModel, bodies: np.ndarray, candidates: MarkerLayou
     Examples
     --------
     >>> from completion import load_layout
+    >>> from completion.mocap.marker_selection.fits import DesignConfig
     >>> from model import load_built_in_model
     >>> model = load_built_in_model()
     >>> among = load_layout("cmu41", model.template, np.array(model.info["people_vertices"]))

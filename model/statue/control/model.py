@@ -139,6 +139,7 @@ class Statue:
     A statue of the generic humanoid itself, with a flat map:
 
     >>> from model.statue.control.files import humanoid
+    >>> from model.statue.control.model import MEASURED, DisplacementMap
     >>> flat = DisplacementMap(np.zeros((16, 16), np.float32), np.full((16, 16), MEASURED, np.uint8))
     >>> Statue(humanoid(), np.zeros((len(humanoid().skeleton.parents), 3)), flat).upright_axis
     2
