@@ -10,8 +10,6 @@ from scipy.sparse import coo_array, csc_array
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.sparse import Factored
 
-PULL = 1e-4                          # pull towards I, as a share of w_s: only decides what the edges leave open
-
 
 def edges(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     """Compute the two edges (..., F, 2, 3) of every triangle from its first vertex.
@@ -32,6 +30,8 @@ class GradientSystem:
     [SCAPE] Eq. 5
     """
 
+    PULL = 1e-4                          # pull towards I, as a share of w_s: only decides what the edges leave open
+
     template: Mesh
     smoothness: float = 0.001
     parts: np.ndarray | None = None
@@ -49,7 +49,7 @@ class GradientSystem:
             pairs = pairs[self.parts[pairs[:, 0]] == self.parts[pairs[:, 1]]]
         F = len(self.template.faces)
         a, b = pairs.T
-        degree = np.bincount(pairs.ravel(), minlength=F) + PULL
+        degree = np.bincount(pairs.ravel(), minlength=F) + self.PULL
         off = coo_array((-np.ones(2 * len(a)), (np.r_[a, b], np.r_[b, a])), shape=(F, F))
         diagonal = coo_array((degree, (np.arange(F), np.arange(F))), shape=(F, F))
         return csc_array(off + diagonal) * self.w_s
@@ -77,7 +77,7 @@ class GradientSystem:
 
     def right_side(self, before: np.ndarray, after: np.ndarray) -> np.ndarray:
         """Compute the right side `Σ_j e_j v_jᵀ` (..., F, 3, 3) of edges (..., F, 2, 3) before, after, and the pull."""
-        return np.swapaxes(before, -1, -2) @ after + PULL * self.w_s * np.eye(3)
+        return np.swapaxes(before, -1, -2) @ after + self.PULL * self.w_s * np.eye(3)
 
 
 def pose_gradients(system: GradientSystem, local: np.ndarray) -> np.ndarray:

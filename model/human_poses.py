@@ -16,7 +16,6 @@ from scanprep.synthetic.poses import average, random_pose
 
 Moments = tuple[np.ndarray, np.ndarray]         # mean (J, 3) and covariance (3J, 3J) of poses, radians
 
-TRUNK = ("pelvis", "abdomen", "chest", "head")
 LIMBS = {"arm": ("upper_arm", "forearm", "hand"), "leg": ("thigh", "shin", "foot")}
 WORTH = 8                            # the poses of all people count as much as so many training poses
 
@@ -41,7 +40,9 @@ def human_poses(template: Mesh, skeleton: Skeleton, count: int, rng: np.random.G
     # for every part: two parts a, b of the synthetic people and a share, how far to interpolate from a to b;
     # and the rotation that takes the bone at rest to that of the synthetic people
     plain = [name.rstrip("0123456789") for name in names]
-    trunk = [{"neck": "head", "trunk": "abdomen"}.get(name, name if name in TRUNK else "pelvis") for name in plain]
+    trunk_parts = ("pelvis", "abdomen", "chest", "head")
+    known = {"neck": "head", "trunk": "abdomen", **{name: name for name in trunk_parts}}
+    trunk = [known.get(name, "pelvis") for name in plain]
     source = [(PARTS.index(part), PARTS.index(part), 0.0) for part in trunk]
     at_rest = np.tile(np.eye(3), (len(names), 1, 1))
     for (kind, side), chain in chains.items():

@@ -39,7 +39,6 @@ FINGERS = {side: tuple(f"{finger}{i}_{side}" for finger in ("index", "middle", "
 # the number of joints tells the members of the family apart
 NAMES = {24: (*BODY, "fingers_left", "fingers_right"), 52: (*BODY, *FINGERS["left"], *FINGERS["right"]),
          55: (*BODY, "jaw", "eye_left", "eye_right", *FINGERS["left"], *FINGERS["right"])}
-FAMILY = {24: "smpl", 52: "smplh", 55: "smplx"}
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,7 +91,8 @@ def import_model(path: str | Path) -> SkinningModel:
     """
     published = read_published(path)
     model = as_skinning(published, {"imported": Path(path).name, "notes": "; ".join(published.notes)})
-    family = "star" if model.features.lift.kind == QuaternionLift.kind else FAMILY.get(len(published.parents), "")
+    families = {24: "smpl", 52: "smplh", 55: "smplx"}
+    family = "star" if model.features.lift.kind == QuaternionLift.kind else families.get(len(published.parents), "")
     if model.skeleton.names == NAMES.get(len(published.parents)):
         model.info["family"] = family        # motions of this family apply to the model without retargeting
     return model

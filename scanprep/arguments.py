@@ -26,7 +26,6 @@ GROUPS = {      # an argument has the same name and meaning in all commands; wha
     "method": "",
     "other": "interactive over serve seed workers preset config write_config force",
 }
-WIDTH = range(60, 101)              # characters of help: narrower breaks the table, wider is hard to read
 
 
 class UsageError(ValueError):
@@ -249,7 +248,8 @@ def make_parser(prog: str, text: str, arguments: Sequence[Argument],
 
     `extend` is called with every argument and its action.
     """
-    width = min(max(shutil.get_terminal_size().columns, WIDTH[0]), WIDTH[-1])
+    widths = range(60, 101)  # characters of help: narrower breaks the table, wider is hard to read
+    width = min(max(shutil.get_terminal_size().columns, widths[0]), widths[-1])
     # wrap paragraphs, but keep examples in one line, so that they can be copied
     paragraphs = [part if part.startswith("Example:") else textwrap.fill(" ".join(part.split()), width)
                   for part in re.split(r"\n\s*\n", text)]

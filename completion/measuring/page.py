@@ -19,7 +19,6 @@ from scanprep.pictures.shading import Bones, Dots, Shape, Solid
 
 SHOWN, BESIDE_EACH_OTHER = 6, 3      # bodies on the page, as more columns do not fit; and bodies in one figure
 HEIGHT = (0.25, 0.30, 0.38)          # colour of the lines of heights: neutral, as they are beside the body
-BESIDE = 0.045                       # metres between the lines of heights
 
 
 def measures_page(names: Sequence[str], bodies: Sequence[np.ndarray], measured: Sequence[Measurements], tapes: Tapes,
@@ -106,12 +105,13 @@ def _pane(name: str, vertices: np.ndarray, measured: Measurements, tapes: Tapes,
     mesh = tapes.template.with_vertices(vertices)
     up, left, ahead = measured.axes
     curves: dict[str, list[np.ndarray]] = {"girths": [], "lengths and widths": [], "heights": []}
-    words, side = list[str](), float((vertices @ left).max()) + BESIDE
+    line_gap = 0.045  # metres between the lines of heights
+    words, side = list[str](), float((vertices @ left).max()) + line_gap
     # sort the tapes into kinds; each line of height goes a little further beside the body
     for term, reading in measured.readings.items():
         tape, curve = tapes.found[term], reading.curve
         if isinstance(tape, Height):
-            curve = curve + (side + len(words) * BESIDE - curve @ left)[:, None] * left
+            curve = curve + (side + len(words) * line_gap - curve @ left)[:, None] * left
             words.append(term.replace("_", " "))
         curves["girths" if isinstance(tape, Girth) else "heights" if isinstance(tape, Height)
                else "lengths and widths"].append(curve)

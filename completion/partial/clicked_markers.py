@@ -14,8 +14,6 @@ from ..mocap.files.markers import READERS, read_markers
 from ..mocap.marker_sets.named import layout_names, layout_on, set_labels
 from .completion import Completion
 
-LAYOUT = "layout.json"
-
 
 def extra_markers(places: Mapping[str, np.ndarray], marks: Mapping[str, int]) -> dict[str, np.ndarray]:
     """Return the clicked points that are not landmarks of the model."""
@@ -30,9 +28,10 @@ def write_clicked_markers(folder: Path, done: Completion, places: Mapping[str, n
     if not places:
         return []
     layout, distances = layout_on(done.completed, {name: done.scale * place for name, place in places.items()})
-    layout.save(folder / LAYOUT)
+    layout_file = "layout.json"
+    layout.save(folder / layout_file)
     far = int(distances.argmax())
-    return [Metric("markers clicked", len(places), f"places on the model in {LAYOUT}"),
+    return [Metric("markers clicked", len(places), f"places on the model in {layout_file}"),
             Metric(f"largest distance of a marker from the body ({layout.labels[far]})", MM * float(distances[far]),
                    "mm")]
 

@@ -38,8 +38,6 @@ from .settings import CompletionConfig
 Progress = Callable[[int, int], None]
 
 KIND, VERSION = "completion", 3       # 1 had no scale, expected error and confidence, 2 no judgement
-_ARRAYS = ("pose", "betas", "trans", "seen", "expected_error", "confidence")
-_FACTS = ("rms", "explained", "landmark_rms", "converged", "iterations")
 
 # Of eleven right completions of synthetic people, seen from one side or all: the worst part is expected to be off by 5
 # to 14 mm, the worst joint 6 to 19 degrees from any known way to hold it, 0.988 to 0.997 of the scan has a body near.
@@ -350,8 +348,10 @@ def save_completion(folder: str | Path, completion: Completion) -> Path:
     folder = Path(folder)
     write_mesh(folder / "completed.ply", completion.completed)
     write_mesh(folder / "predicted.ply", completion.predicted)
-    arrays = {name: getattr(completion, name) for name in _ARRAYS if getattr(completion, name) is not None}
-    facts = {name: getattr(completion, name) for name in (*_FACTS, "energies", "scale", "soles")}
+    array_names = ("pose", "betas", "trans", "seen", "expected_error", "confidence")
+    arrays = {name: getattr(completion, name) for name in array_names if getattr(completion, name) is not None}
+    fact_names = ("rms", "explained", "landmark_rms", "converged", "iterations")
+    facts = {name: getattr(completion, name) for name in (*fact_names, "energies", "scale", "soles")}
     facts["judgement"] = str(completion.judgement)
     storage.save(folder / "completion.npz", KIND, VERSION, arrays, facts)
     return folder

@@ -10,8 +10,6 @@ from scanprep.geometry.mesh import Mesh
 
 # Both chosen for the least Brier score of the stated probabilities at 5, 10, 20 and 40 mm. Data: completed half views
 # of tuning bodies, 14 poses of a known man and 7 men of unknown shape, none of which the models were learned from.
-BEYOND = 0.0075                      # metres: error of the model itself, far from all data
-LEFT_OUT = 0.85                      # the same as a share of the model's error on left-out poses, where that is known
 
 
 def posterior_error(body: FixedBody, x: np.ndarray, precision: np.ndarray) -> np.ndarray:
@@ -56,7 +54,9 @@ def estimate_error(posterior: np.ndarray, away: np.ndarray, rms: float, left_out
     left_out : float, metres, optional
         Error of the model on poses that it was not learned from, where that is known.
     """
-    beyond = BEYOND if left_out is None else LEFT_OUT * left_out
+    model_error = 0.0075  # metres: error of the model itself, far from all data
+    left_out_share = 0.85  # the same as a share of the model's error on left-out poses, where that is known
+    beyond = model_error if left_out is None else left_out_share * left_out
     # 14 mm along the surface: scale over which both errors set in, tuned as above
     sets_in = 1 - np.exp(-away / 0.014)
     # 0.5 mm: no scan is better

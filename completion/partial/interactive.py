@@ -8,7 +8,7 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -45,11 +45,6 @@ from .work import (
 )
 
 ENDING = ".landmarks.json"           # of landmark files beside a scan
-COMPLETED = "completed.ply"
-FEWEST = 3                           # landmarks that fix position and orientation of a body
-TOLD = {"good": "completed: look at it from all sides, then save; or move or add landmarks and complete again",
-        "check": "completed, but look at it: move or add landmarks and complete again, or save",
-        "failed": "the completion failed: correct landmarks, then start over"}
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,6 +76,14 @@ class CompleteApp(PickApp):
     dropped : Dropped, optional
         Keeps scans that are dropped on the page; without it the app keeps them until it closes.
     """
+
+    COMPLETED = "completed.ply"
+    FEWEST = 3                           # landmarks that fix position and orientation of a body
+    # what to do next, by the verdict
+    TOLD: ClassVar[dict[str, str]] = {
+        "good": "completed: look at it from all sides, then save; or move or add landmarks and complete again",
+        "check": "completed, but look at it: move or add landmarks and complete again, or save",
+        "failed": "the completion failed: correct landmarks, then start over"}
 
     name, title = "complete", "Complete a scan"
 
@@ -157,7 +160,7 @@ class CompleteApp(PickApp):
         made = self.made.get(self.scan.path) if self.scan else None
         markers = extra_markers(self.scan.places, self.work.marks) if self.scan else {}
         out: dict[str, Any] = {"known": self.known, "can_choose": self.can_choose, "completed": None,
-                               "markers": len(markers), "fewest": FEWEST}
+                               "markers": len(markers), "fewest": self.FEWEST}
         if made is None or self.scan is None:
             return out
         judgement, saved = made.completion.judgement, self.saved.get(self.scan.path)
@@ -165,7 +168,7 @@ class CompleteApp(PickApp):
             "verdict": judgement.verdict, "reasons": list(judgement.reasons), "landmarks": len(made.places),
             "rows": [[m.name, m.text(), m.unit] for m in self._figures(made)],
             "outdated": self._is_outdated(made), "helpful": helpful(made.completion, self.work.marks, made.places),
-            "saved": str(saved.absolute() / COMPLETED) if saved else ""}
+            "saved": str(saved.absolute() / self.COMPLETED) if saved else ""}
         return out
 
     def _figures(self, made: Made) -> list[Metric]:
@@ -250,8 +253,8 @@ class CompleteApp(PickApp):
         if self.working is not None:
             return
         names = self._usable(self.scan)
-        if 0 < len(names) < FEWEST:
-            raise ValueError(f"click at least {FEWEST} landmarks, or none")
+        if 0 < len(names) < self.FEWEST:
+            raise ValueError(f"click at least {self.FEWEST} landmarks, or none")
         made = self.made.get(self.scan.path)
         # go on from the last result if it is of the same kind and did not fail
         on = made is not None and made.known == self.known and names and not anew \
@@ -269,7 +272,7 @@ class CompleteApp(PickApp):
                 scan.predicted = on_scan(done, self.work.marks, scan.body)
             if scan is self.scan:
                 send(self.scene())
-            return TOLD[done.judgement.verdict]
+            return self.TOLD[done.judgement.verdict]
 
         self.beside("completing", work, send, "this scan could not be completed")
 
@@ -326,7 +329,7 @@ class CompleteApp(PickApp):
         with workspace(folder) as space, space.staging("completion") as staged:
             self._write(scan, made, staged.folder)
         self.saved[scan.path] = folder
-        self.note = f"saved: {folder.absolute() / COMPLETED}, and beside it the pose, the shape and a page"
+        self.note = f"saved: {folder.absolute() / self.COMPLETED}, and beside it the pose, the shape and a page"
 
     def folder_of(self, scan: Clicked) -> Path:
         """Return the folder for the results of a scan."""

@@ -29,13 +29,8 @@ from .motions import of_markers, of_motion, read_recording
 from .soft import soft_tissue_of, with_soft_tissue
 from .statues import read_statue
 
-# endings of files that belong to a mesh or model: landmarks and marker layouts
-PLACES = (".pp", ".json", ".lnd", ".landmarks.txt", ".landmarks.csv", ".fcsv")
 # files by which folders of commands are recognised
 COMPLETION, MOTION, SET = "completion.npz", "motion.npz", "set.json"
-# kinds of files that are shown from a folder
-SHOWN = ("surface", "picture", "model", "motion", "markers")
-DEEP = 3                             # levels of folders to search: people, their recordings, and the results of these
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,6 +66,12 @@ class Files:
         Of motions and markers, where files do not say or say it wrongly.
     """
 
+    # endings of files that belong to a mesh or model: landmarks and marker layouts
+    PLACES = (".pp", ".json", ".lnd", ".landmarks.txt", ".landmarks.csv", ".fcsv")
+    # kinds of files that are shown from a folder
+    SHOWN = ("surface", "picture", "model", "motion", "markers")
+    DEEP = 3                           # levels of folders to search: people, their recordings, and the results of these
+
     def __init__(self, paths: tuple[Path, ...] = (), model: Path | None = None, unit: Unit | None = None,
                  over: bool = False, rate: float | None = None) -> None:
         self.paths, self.model, self.unit, self.over, self.rate = paths, model, unit, over, rate
@@ -92,7 +93,7 @@ class Files:
                 path = picture
             if path.name in (ABOUT, CONTROL) and (path.parent / ABOUT).is_file():   # a file of a statue: show it all
                 path = path.parent
-            if path.name.lower().endswith(PLACES):
+            if path.name.lower().endswith(self.PLACES):
                 self._lay_on(entries, path)
             else:
                 entries += self._of_folder(path) if path.is_dir() else [self._of_file(path, path.name)]
@@ -106,7 +107,7 @@ class Files:
         """Return the entries with those of one more file or folder, which replace earlier ones of the same path."""
         self._models.pop(path.resolve(), None)
         self.known = {kind: tuple(one for one in paths if one != path) for kind, paths in self.known.items()}
-        if path.name.lower().endswith(PLACES):
+        if path.name.lower().endswith(self.PLACES):
             # landmarks: on the mesh that they lie beside, else on the last thing
             changed = list(entries)
             beside = [i for i, entry in enumerate(changed) if landmarks_beside(entry.path) == path]
@@ -190,7 +191,7 @@ class Files:
 
     def _of_folder(self, folder: Path) -> list[Entry]:
         """List the things of a folder."""
-        entries = list(self._inside(folder, folder.resolve().name, DEEP))
+        entries = list(self._inside(folder, folder.resolve().name, self.DEEP))
         if not entries:
             raise ValueError(f"{folder}: expected meshes, a registered set, or what a command wrote; found none")
         return entries
@@ -219,7 +220,7 @@ class Files:
                     yield from self._inside(path, f"{name}/{path.name}", deep - 1)
                 # not by themselves: tables hold anything, and a BVH needs a model
                 elif path.is_file() and path.suffix.lower() not in (".csv", ".tsv", ".txt", ".bvh") \
-                        and viewable_kind(path) in SHOWN:
+                        and viewable_kind(path) in self.SHOWN:
                     yield self._of_file(path, f"{name}/{path.name}")
 
     def _of_set(self, folder: Path, name: str) -> Iterator[Entry]:
@@ -281,7 +282,7 @@ class Files:
         """Find the model of a motion: the named one, that of the report beside it, or one among the files."""
         if self.model is not None:
             return self.read_model(self.model)
-        for folder in list(path.resolve().parents)[:DEEP]:
+        for folder in list(path.resolve().parents)[:self.DEEP]:
             name = model_of_report(folder / "report.json")
             if name is not None:
                 return self.read_model(name)

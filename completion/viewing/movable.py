@@ -16,7 +16,6 @@ from scanprep.geometry.mesh import Mesh
 from scanprep.skeleton.roles import in_words
 
 FEW = 3                              # differences to add at a new pose: for more, a new operator is faster
-KEPT = 24                            # differences kept in memory, the most recently used
 
 
 class MovableBody:
@@ -27,6 +26,8 @@ class MovableBody:
     model : BodyModel
         The model.
     """
+
+    KEPT = 24                            # differences kept in memory, the most recently used
 
     def __init__(self, model: BodyModel) -> None:
         self.model, self.skeleton = model, model.skeleton
@@ -47,7 +48,7 @@ class MovableBody:
         """
         moved = not np.array_equal(pose, self._pose)
         changed = self._find_changed(betas)
-        if changed is None or len(changed) > (FEW if moved else KEPT):
+        if changed is None or len(changed) > (FEW if moved else self.KEPT):
             self._settle(betas)
             changed, moved = np.zeros(0, dtype=np.int64), True
         if moved:
@@ -122,7 +123,7 @@ class MovableBody:
             unit[k] = 1
             gained = self.model.operator(unit).plus(-1, self.model.operator(np.zeros_like(unit)))
             self._differences[k] = gained.astype(np.float32)
-            while len(self._differences) > KEPT:
+            while len(self._differences) > self.KEPT:
                 self._differences.popitem(last=False)
         self._differences.move_to_end(k)
         return self._differences[k]

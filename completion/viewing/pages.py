@@ -19,9 +19,7 @@ from ..partial.work import CompletionTask
 from .files import Entry, Files
 from .saving import free_name
 
-PEOPLE = "built-in people"           # name of the model for people who have none
 Progress = Callable[[int, int], None]
-SCANS = ("surface", "picture")       # kinds of entries that can be completed
 
 
 # Commands whose results can be corrected: text of the button, and the app for the folder.
@@ -71,6 +69,9 @@ class Inside:
         Files dropped on the view, which pages may use.
     """
 
+    PEOPLE = "built-in people"           # name of the model for people who have none
+    SCANS = ("surface", "picture")       # kinds of entries that can be completed
+
     def __init__(self, files: Files, output: Path, dropped: Dropped) -> None:
         self.files, self.output, self.dropped = files, output, dropped
         self.opened: dict[tuple[str, Path | None], App] = {}
@@ -81,8 +82,8 @@ class Inside:
         return {"folders": [{"page": "mend", "folder": str(folder),
                              "label": f"{MENDED[command][0]} {folder.resolve().name}"}
                             for folder, command in commands.items() if command in MENDED],
-                "scans": [i for i, entry in enumerate(entries) if entry.kind in SCANS],
-                "models": [{"path": "", "name": PEOPLE},
+                "scans": [i for i, entry in enumerate(entries) if entry.kind in self.SCANS],
+                "models": [{"path": "", "name": self.PEOPLE},
                            *({"path": str(path), "name": path.name} for path in self.files.models)]}
 
     def enter(self, entries: Sequence[Entry], wanted: Mapping[str, Any], progress: Progress) -> App:
@@ -103,7 +104,7 @@ class Inside:
 
     def _completion(self, scan: Entry, model: str, progress: Progress) -> App:
         """Open the page that completes scans with a model, and show a scan there."""
-        if scan.kind not in SCANS:
+        if scan.kind not in self.SCANS:
             raise ValueError(f"{scan.name}: expected a scan, found {scan.kind}")
         path = next((path for path in self.files.models if str(path) == model), None)
         if path is None and model:
@@ -113,7 +114,7 @@ class Inside:
             if path is None:
                 from model.files import BUILT_IN, load_model
 
-                loaded, name = load_model(BUILT_IN), PEOPLE
+                loaded, name = load_model(BUILT_IN), self.PEOPLE
             else:
                 loaded, name = self.files.read_model(path), str(path)
             body = loaded if loaded.n_betas else loaded.subject(None)

@@ -17,8 +17,6 @@ from ..motion import Motion
 from .contents import Content
 from .motions import AT_ONCE, MADE, columns_of, of_motion, with_markers
 
-SOFT = (0.55, 0.66, 0.80)            # colour of the body with soft tissue, to tell it from the other
-
 
 def of_soft_tissue(name: str, soft: SoftTissue, model: BodyModel) -> Content:
     """Show a motion with soft tissue; hidden at first, the same with the person's own shape throughout."""
@@ -46,7 +44,9 @@ def with_soft_tissue(content: Content, soft: SoftTissue, model: BodyModel, marke
     basis, coefficients = soft_columns(soft, model, frames)
     moved = soft.movement(model)
     shade = Heat(moved, 0.0, max(float(np.quantile(moved, 0.995)), 1e-3), "moved by soft tissue")
-    body = Solid(model.template.with_vertices(frames[0]), SOFT, shades={"soft tissue": shade}, name="with soft tissue")
+    # colour of the body with soft tissue, to tell it from the other
+    body = Solid(model.template.with_vertices(frames[0]), (0.55, 0.66, 0.80), shades={"soft tissue": shade},
+                 name="with soft tissue")
     changing = Moving(body, frames[:1].astype(np.float32), soft.motion.rate, (basis, coefficients))
     # the body of fixed shape is hidden at first
     fixed = [replace(shape, shape=replace(shape.shape, name="fixed shape", visible=False))

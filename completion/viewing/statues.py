@@ -20,7 +20,6 @@ from .contents import Content, Stance, sizes
 from .movable import MovableBody
 
 LEVEL = 3                            # level of detail: 64 triangles for one of the control mesh; a move takes 1 to 4 ms
-FILLED = (0.55, 0.66, 0.80)          # colour of surface that fills a hole of the scan
 
 
 class MovableStatue(MovableBody):
@@ -89,13 +88,14 @@ def of_statue(name: str, statue: Statue, model: BodyModel | None = None) -> Cont
     mesh = Reconstruction(control, statue.map, fine).mesh()
     # colours for surface that was measured, folded over, or filled where the scan has a hole
     kind = coverage_at(control, statue.map, fine.parent, fine.bary)
-    measured = np.array([CLAY, (0.93, 0.62, 0.12), FILLED])[
+    filled = (0.55, 0.66, 0.80)  # colour of surface that fills a hole of the scan
+    measured = np.array([CLAY, (0.93, 0.62, 0.12), filled])[
         np.select([kind == MEASURED, kind == FOLDED, kind == HOLE], [0, 1, 2])]
     shades = {"parts": part_colors(control.skeleton.part_of_face)[fine.face_parent], "what was measured": measured}
     if statue.texture is not None:
         colors = bilinear(statue.texture, chart_places(control.chart, fine.parent, fine.bary)) / 255
         mesh, shades = Mesh(mesh.vertices, mesh.faces, colors), {"plain": np.array(CLAY), **shades}
     shapes = [Solid(mesh, shades=shades, name="statue"),
-              Solid(control.mesh, FILLED, name="control mesh", visible=False)]
+              Solid(control.mesh, filled, name="control mesh", visible=False)]
     return Content(name, shapes, Stance.of(mesh), f"{sizes(mesh)}, {len(control.skeleton.parents)} parts",
                    model=model or body_model(control), statue=statue)

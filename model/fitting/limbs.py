@@ -20,7 +20,6 @@ REACHES = (0.2, 0.15, 0.1)           # metres: largest match distance in the rou
 SKIN, SCAN = 80, 120                 # vertices of a limb and points of the scan by which a random pose is judged
 CAP = 0.1                            # metres: largest violation that counts; more is as bad
 CAPS, NOISES = (0.4, 0.25, 0.15, 0.1), (0.4, 0.25, 0.15, 0.1)   # metres and radians: caps and noise of finer rounds
-CELL = 0.03                          # metres: cell of the table of the inside of a body
 EXPLAINED = 0.04                     # metres: scan points this near to the rest of the body need no limb
 FOLLOWED, APART = 4, 0.1             # random poses that are refined, and metres by which they differ at the limb's end
 AMISS = 30.0                         # energy from which on a limb counts as misplaced
@@ -204,6 +203,8 @@ def nearest_squared(places: np.ndarray, points: np.ndarray) -> np.ndarray:
 class InsideBody:
     """A table of how deep points are inside part of a body."""
 
+    CELL = 0.03                          # metres: cell of the table of the inside of a body
+
     low: np.ndarray                  # (3,), metres
     deep: np.ndarray                 # (a, b, c), metres
 
@@ -211,7 +212,8 @@ class InsideBody:
     def of(vertices: np.ndarray, normals: np.ndarray) -> InsideBody:
         """Build the table for vertices (n, 3), metres, with their normals (n, 3)."""
         low = vertices.min(axis=0)
-        axes = [np.arange(a, b + CELL, CELL) for a, b in zip(low, vertices.max(axis=0), strict=True)]
+        axes = [np.arange(a, b + InsideBody.CELL, InsideBody.CELL) for a,
+                b in zip(low, vertices.max(axis=0), strict=True)]
         grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
         far, hit = cKDTree(vertices).query(grid.reshape(-1, 3), distance_upper_bound=INSIDE)
         near = np.isfinite(far)
@@ -221,7 +223,7 @@ class InsideBody:
 
     def depth(self, places: np.ndarray) -> np.ndarray:
         """Look up the depth (...), metres, of points (..., 3)."""
-        cell = np.rint((places - self.low) / CELL).astype(np.int64)
+        cell = np.rint((places - self.low) / self.CELL).astype(np.int64)
         within = ((cell >= 0) & (cell < self.deep.shape)).all(axis=-1)
         cell = np.where(within[..., None], cell, 0)
         return np.where(within, self.deep[cell[..., 0], cell[..., 1], cell[..., 2]], 0.0)

@@ -9,7 +9,6 @@ from scipy.spatial import cKDTree
 from scanprep.geometry.sparse import spanning_tree
 from scanprep.threads import search_threads
 
-COARSE = 2000                        # points that show the overall form
 GRAZING = 0.3                        # cosine: a scanner sees little of surfaces more oblique than this
 
 
@@ -80,7 +79,8 @@ def turn_outward(points: np.ndarray, normals: np.ndarray, near: np.ndarray, dist
     out = np.where(np.array(flipped)[:, None], -normals, normals)
     # 2. the side on which a patch bulges, by neighbours within 12 cm of every fourth point: at that scale bodies are
     # convex enough to tell inside from outside
-    coarse = points[spread_points(points, COARSE)] if n > COARSE else points
+    coarse_count = 2000  # points that show the overall form
+    coarse = points[spread_points(points, coarse_count)] if n > coarse_count else points
     at = np.r_[roots, 0:n:4]
     far, around = cKDTree(coarse).query(points[at], 48, distance_upper_bound=0.12, workers=search_threads(len(at)))
     found = np.isfinite(far)

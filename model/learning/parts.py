@@ -21,7 +21,6 @@ from .scape import Progress, ProgressShares, learn_pose
 
 QUICK = LearnConfig(prunings=(0.01,), ridges=(1e-3, 1e-2), refinements=1)    # models that are only compared
 MORE, TRIES = 4, 3                   # parts added at each try, and most tries
-VERTICES = 2500                      # of the coarse bodies on which models are compared: a model in seconds
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,11 +71,12 @@ def choose_skeleton(template: Mesh, poses: np.ndarray, progress: Progress | None
     whole = 1 + settings.restarts + TRIES
     shown = poses if known is None else np.concatenate([poses, known])
     finder = SkeletonFinder(template, shown, settings, lambda done, total: tell(done, whole), step)
-    vertices, coarse = coarse_copy(template, VERTICES)
+    coarse_vertices = 2500  # of the coarse bodies on which models are compared: a model in seconds
+    vertices, coarse = coarse_copy(template, coarse_vertices)
 
     def tried(parts: int | None) -> tuple[Skeleton, float] | None:
         name = "best parts" if parts is None else f"{parts} parts"
-        return step(name, (template, poses, settings, parts, QUICK, VERTICES, known),
+        return step(name, (template, poses, settings, parts, QUICK, coarse_vertices, known),
                     lambda: _try_parts(finder, parts, coarse, poses[:, vertices],
                                        None if known is None else known[:, vertices]))
 

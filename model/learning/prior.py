@@ -24,10 +24,6 @@ from ..posing.transfer import own_body
 from ..priors import sample_poses
 from ..resolution.transfer import SurfaceCarrier, transfer_skeleton
 
-# Number of the model's example poses that are used, evenly over all. With 50, the skeleton of 8 poses had parts without
-# a name, though held-out poses were 8.5 mm off, and 9.1 mm with 25.
-EXAMPLES = 25
-
 
 @dataclass(frozen=True, eq=False)
 class TemplatePrior:
@@ -84,8 +80,12 @@ def bring_prior(model: BodyModel, template: Mesh, progress: Callable[[int, int],
     own = own_body(model, laid.vertices)
     ride = SurfaceCarrier(laid.with_vertices(own.vertices), template)
     # the person in the model's example poses; models without examples draw from their prior
-    known = model.pose_examples if len(model.pose_examples) else sample_poses(model, EXAMPLES, np.random.default_rng(0))
-    examples = known[np.unique(np.linspace(0, len(known) - 1, EXAMPLES).astype(int))]
+    # Number of the model's example poses that are used, evenly over all. With 50, the skeleton of 8 poses had parts
+    # without a name, though held-out poses were 8.5 mm off, and 9.1 mm with 25.
+    n_examples = 25
+    known = model.pose_examples if len(model.pose_examples) else sample_poses(model, n_examples,
+                                                                              np.random.default_rng(0))
+    examples = known[np.unique(np.linspace(0, len(known) - 1, n_examples).astype(int))]
     moved = np.stack([ride.positions(own.subject.vertices(pose)) for pose in examples])
     # other people in the template's pose
     steps = np.vstack([np.zeros(model.n_betas), np.eye(model.n_betas)])

@@ -23,7 +23,6 @@ from ..skinning import SkinningModel, invert_blended
 from .regression import ridge_operator
 from .scape import POSES, Progress, ProgressShares, check_training, estimate_pose_prior, fit_poses, pose_examples
 
-RIDGES = (1e-4, 1e-3, 3e-3, 0.01, 0.03, 0.1, 0.3)      # penalties, of which the best on left-out poses is taken
 QUICK = FitConfig(sample=400, iterations=20, polish=0, tolerance=1e-4)     # poses are fitted again in the next round
 
 
@@ -220,7 +219,8 @@ def _with_correctives(model: SkinningModel, poses: np.ndarray, bodies: np.ndarra
     unposed = np.stack([_unpose(model, p, y) for p, y in zip(poses, bodies, strict=True)])
     features = corrective_features(model.skeleton, poses, config.correctives)
     joints = _acting_joints(model)
-    ridges = RIDGES if features.count > len(features.starts) else RIDGES[:1]
+    penalties = (1e-4, 1e-3, 3e-3, 0.01, 0.03, 0.1, 0.3)  # penalties, of which the best on left-out poses is taken
+    ridges = penalties if features.count > len(features.starts) else penalties[:1]
     tried = [(ridge, *_regress(features, poses, unposed, joints, ridge)) for ridge in ridges]
     ridge, rest, correctives, error = min(tried, key=itemgetter(-1))
     moved = _with_joints_at(replace(model, rest=rest), model.joint_regressor @ model.rest)

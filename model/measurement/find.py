@@ -15,8 +15,6 @@ from .marks import BodyLandmarks, body_landmarks
 from .section import Carried, SectionCurve, direction, mean_of, section, tape
 from .tapes import Extent, Found, Girth, Height, Span, Straight, Tapes, Way, Weight
 
-BAND = 0.10                          # metres along the surface, for 1.75 m: a tape stays this near to its place
-
 
 class _NotThereError(ValueError):
     """A measurement that cannot be found on a template; the message says why."""
@@ -69,6 +67,8 @@ def find_tapes(template: Mesh, landmarks: Mapping[str, int]) -> Tapes:
 class _Finder:
     """The recipe of each measurement, on one template."""
 
+    BAND = 0.10                          # metres along the surface, for 1.75 m: a tape stays this near to its place
+
     def __init__(self, places: BodyLandmarks) -> None:
         self.places, self.mesh = places, places.mesh
         self.graph = SurfaceGraph(self.mesh)
@@ -112,7 +112,7 @@ class _Finder:
         """Yield the recipes of one leg, from above."""
         p, knee, heel = self.places, (f"{side} knee", f"{side} knee inside"), f"{side} heel"
         yield f"thigh_girth_{side}", lambda: self.keep(f"thigh_girth_{side}", self.level(
-            0.5 * (p.at(*knee) + p.at(f"{side} hip")), p.height("crotch") - 0.04 * self.scale), None, BAND)
+            0.5 * (p.at(*knee) + p.at(f"{side} hip")), p.height("crotch") - 0.04 * self.scale), None, self.BAND)
         yield f"knee_girth_{side}", lambda: self.keep(f"knee_girth_{side}", None, self.shin(side))
         yield f"calf_girth_{side}", lambda: self.extreme(f"calf_girth_{side}", 1, lambda t: self.along(
             p.at(*knee), p.at(heel), 0.12 + 0.4 * t), self.shin(side))
@@ -220,7 +220,7 @@ class _Finder:
 
     def trunk(self, name: str, height: float) -> Girth:
         """Find a level girth of the trunk."""
-        return self.keep(name, self.level(self.middle(), height), None, BAND, name != "waist_girth")
+        return self.keep(name, self.level(self.middle(), height), None, self.BAND, name != "waist_girth")
 
     def middle(self) -> np.ndarray:
         """Return a point (3,) on the axis of the trunk."""
@@ -236,14 +236,14 @@ class _Finder:
             return self.trunk("waist_girth", p.height("left waist", "right waist"))
         low, high = p.height("crotch"), p.height("left nipple", "right nipple")
         return self.extreme("waist_girth", -1, lambda t: self.level(
-            self.middle(), low + (0.35 + 0.5 * t) * (high - low)), None, BAND)
+            self.middle(), low + (0.35 + 0.5 * t) * (high - low)), None, self.BAND)
 
     def hips(self) -> Girth:
         """Find the widest section from the crotch up to two thirds of the way to the waist."""
         p = self.places
         low, high = p.height("crotch"), p.height("left waist", "right waist", "navel")
         return self.extreme("hip_girth", 1, lambda t: self.level(
-            self.middle(), low + (0.12 + 0.55 * t) * (high - low)), None, BAND)
+            self.middle(), low + (0.12 + 0.55 * t) * (high - low)), None, self.BAND)
 
     def neck(self) -> Girth:
         """Find the narrowest section across the neck, also among planes that sink towards the throat.

@@ -13,8 +13,6 @@ from .measure import measure
 from .reading import DENSITY_SPREAD
 from .tapes import Tapes
 
-OFTEN = 1.6449                       # standard deviations within which 90% of a Gaussian are
-
 
 @dataclass(frozen=True, eq=False)
 class WantedBody:
@@ -182,6 +180,8 @@ class _Search:
     metres and kilograms are comparable.
     """
 
+    OFTEN = 1.6449                       # standard deviations within which 90% of a Gaussian are
+
     def __init__(self, base: np.ndarray, moves: np.ndarray, tapes: Tapes, wanted: Mapping[str, float]) -> None:
         self.base, self.moves, self.tapes, self.wanted = base, moves, tapes, wanted
         self.rows = alike(wanted)
@@ -250,7 +250,7 @@ class _Search:
             if name not in self.wanted:
                 by_z = reading.along(self.moves)
                 variance = max(float(by_z @ by_z - (S @ by_z) @ (K @ by_z)), 0.0)
-                half = OFTEN * float(np.sqrt(variance + reading.unknown**2))
+                half = self.OFTEN * float(np.sqrt(variance + reading.unknown**2))
                 likely[name] = (reading.value - half, reading.value, reading.value + half)
         return WantedBody(betas, vertices, dict(self.wanted), {name: whole.values[name] for name in self.wanted}, far,
                           float(chi2.sf(far**2, free)), likely, self.usual(), sex)
@@ -264,7 +264,7 @@ class _Search:
         for i, sides in enumerate(self.rows):
             others = what != what[i]                                   # the other side says the same
             K = np.linalg.solve(C[np.ix_(others, others)], C[others, i])
-            middle, half = values[i] + K @ off[others], OFTEN * np.sqrt(C[i, i] - K @ C[others, i])
+            middle, half = values[i] + K @ off[others], self.OFTEN * np.sqrt(C[i, i] - K @ C[others, i])
             both = (float((middle - half) * self.unit[i]), float((middle + half) * self.unit[i]))
             ranges |= dict.fromkeys(sides, both)
         return ranges

@@ -24,7 +24,6 @@ RATES = ("mocap_frame_rate", "mocap_framerate", "fps", "frame_rate", "framerate"
 _PIECES = ({"root_orient": 3, "global_orient": 3}, {"pose_body": 63, "body_pose": 63},
            {"pose_jaw": 3, "jaw_pose": 3}, {"pose_eye": 6, "leye_pose": 3}, {"reye_pose": 3},
            {"pose_hand": 90, "left_hand_pose": 45}, {"right_hand_pose": 45})
-_PLACES = ("trans", "transl")
 # motion files of other programs by their ending: what they are, and what to export instead
 _ROTATIONS = "holds rotations of segments and no markers; export BVH in its place, for scape animate"
 OTHER_MOTIONS = {
@@ -84,8 +83,9 @@ def read_motion_file(path: str | Path, more: Collection[str] = (), parts: int | 
                            "puts it on a model")
     if path.suffix.lower() in OTHER_MOTIONS:
         raise StorageError(f"{path}: expected a motion (.npz), found {OTHER_MOTIONS[path.suffix.lower()]}")
+    place_names = ("trans", "transl")
     what, wanted = "a motion (.npz)", (
-        "poses", *_PLACES, "betas", *RATES, *(name for piece in _PIECES for name in piece), *more)
+        "poses", *place_names, "betas", *RATES, *(name for piece in _PIECES for name in piece), *more)
     # only known arrays are read; poses in pieces are joined
     a = storage.load_arrays(path, what, wanted)
     for name in ("gender", "surface_model_type"):        # pickled objects in some files: these are skipped
@@ -96,7 +96,7 @@ def read_motion_file(path: str | Path, more: Collection[str] = (), parts: int | 
     if "poses" not in a and _whole_body(a):
         with storage.taking_apart(path, "a whole motion"):
             a["poses"] = _join_poses(a)
-    places = [a[name] for name in _PLACES if name in a]
+    places = [a[name] for name in place_names if name in a]
     lacking = [name for name, found in (("poses", "poses" in a), ("trans", places)) if not found]
     if lacking:
         raise StorageError(f"{path}: expected a motion, it lacks {' and '.join(lacking)}")

@@ -20,8 +20,6 @@ from .registration.automatic import Features, find_features
 from .registration.features import FeatureFit, fit_features, head_share, warp
 from .registration.surface_fit import SurfaceFit, SurfaceFitConfig, fit_surface
 
-FACE = ("left eye", "right eye", "nose tip", "mouth", "chin", "left ear", "right ear", "top of head")
-
 
 @dataclass(frozen=True)
 class StatueConfig(Settings):
@@ -153,7 +151,8 @@ def pose_by_features(control: ControlModel, joints: Mapping[str, np.ndarray], po
 
 def with_head(control: ControlModel, fit: FeatureFit, points: Mapping[str, np.ndarray]) -> Posed:
     """Warp the head of a control model that was posed by features to the points of the face. [Statues] Eq. 5"""
-    start, face = fit.vertices, [name for name in FACE if name in points]
+    face_names = ("left eye", "right eye", "nose tip", "mouth", "chin", "left ear", "right ear", "top of head")
+    start, face = fit.vertices, [name for name in face_names if name in points]
     if "skullbase" not in control.skeleton.names:
         face = []
     try:

@@ -19,7 +19,6 @@ from scipy.sparse import sparray
 from ..geometry import storage
 from .values import PACKAGES
 
-DIGITS = 32                    # hexadecimal digits of SHA-256 that are kept: 128 bits, no collision in practice
 INSTALLED = Path(__file__).parents[2]   # the folder of the three packages
 # nanoseconds: clocks of file systems tick in steps of up to two seconds, so a younger file may change unnoticed
 SETTLED = 2_000_000_000
@@ -31,6 +30,8 @@ class Digests:
     Digests of files are kept in the file at `path`, and hold as long as size and modification times stay the same.
     A file changed less than two seconds before it was read is read again the next time.
     """
+
+    DIGITS = 32                    # hexadecimal digits of SHA-256 that are kept: 128 bits, no collision in practice
 
     def __init__(self, path: Path | None = None) -> None:
         self.path = path
@@ -53,7 +54,7 @@ class Digests:
         hasher = hashlib.sha256()
         for value in values:
             self._update(hasher, value)
-        return hasher.hexdigest()[:DIGITS]
+        return hasher.hexdigest()[:self.DIGITS]
 
     def key(self, *values: Any) -> str:
         """Compute a digest of values together with the version and sources of this program."""
@@ -83,7 +84,7 @@ class Digests:
                 # read in pieces of a megabyte, as scans may be larger than the memory
                 while block := file.read(1 << 20):
                     hasher.update(block)
-            digest = hasher.hexdigest()[:DIGITS]
+            digest = hasher.hexdigest()[:self.DIGITS]
         except OSError:
             return "missing"
         # remember it only when a later change would show in the modification time

@@ -16,8 +16,6 @@ from ..ranges import Cell, Cosine, Range, Settings, Share
 from ..repair.manifold import drop_small_components, split_vertices
 
 BLOCK = 4                      # voxels along the side of a block, the unit of sparse storage; limits the truncation
-# corners of a cell in the order of marching cubes
-CORNERS = np.array([(0, 0, 0), (1, 0, 0), (1, 1, 0), (0, 1, 0), (0, 0, 1), (1, 0, 1), (1, 1, 1), (0, 1, 1)])
 
 
 @dataclass(frozen=True)
@@ -247,9 +245,11 @@ def _zero_surface(grid: _Grid, keys: np.ndarray, points: np.ndarray, distance: n
     shape, voxel = grid.shape, grid.voxel
     # corner indices of every cell; keep cells with eight known corners and a change of sign
     step = np.array([shape[1] * shape[2], shape[2], 1])
-    place = np.searchsorted(keys, keys[:, None] + CORNERS @ step)
+    # corners of a cell in the order of marching cubes
+    corners = np.array([(0, 0, 0), (1, 0, 0), (1, 1, 0), (0, 1, 0), (0, 0, 1), (1, 0, 1), (1, 1, 1), (0, 1, 1)])
+    place = np.searchsorted(keys, keys[:, None] + corners @ step)
     place = np.minimum(place, max(len(keys) - 1, 0))
-    whole = (keys[place] == keys[:, None] + CORNERS @ step).all(axis=1)
+    whole = (keys[place] == keys[:, None] + corners @ step).all(axis=1)
     whole &= np.all([at < size - 1 for at, size in zip(np.unravel_index(keys, shape), shape, strict=True)], axis=0)
     cells = place[whole]
     inside = (distance < 0)[cells].sum(axis=1)

@@ -13,7 +13,6 @@ import numpy as np
 from . import rotations, storage
 from .format_common import Contents, MeshFileError, polygons, strip_triangles
 
-_METRES = {"micron": 1e-6, "millimeter": 1e-3, "centimeter": 1e-2, "inch": 0.0254, "foot": 0.3048, "meter": 1.0}
 _DEEPEST = 100               # deepest nesting of nodes or components; stops cycles
 
 
@@ -186,6 +185,7 @@ def _source(ids: dict[str, ElementTree.Element], element: ElementTree.Element) -
 def read_3mf(path: Path, data: bytes) -> Contents:
     """Read the meshes that a 3MF file builds, in its own unit; supports are left out."""
     unpacked = 100  # largest packing ratio; meshes have about ten, more is a decompression bomb
+    factors = {"micron": 1e-6, "millimeter": 1e-3, "centimeter": 1e-2, "inch": 0.0254, "foot": 0.3048, "meter": 1.0}
     with (storage.taking_apart(path, "a whole 3MF file", MeshFileError), np.errstate(all="ignore"),
           zipfile.ZipFile(io.BytesIO(data)) as archive):
         if sum(info.file_size for info in archive.infolist()) > 2**24 + unpacked * len(data):
@@ -219,7 +219,7 @@ def read_3mf(path: Path, data: bytes) -> Contents:
 
         for item in part(start).iterfind("build/item"):
             show(item.get("path", start), item.attrib["objectid"], _transform(item), 0)
-        metres = _METRES[part(start).get("unit", "millimeter")]
+        metres = factors[part(start).get("unit", "millimeter")]
     return scene.contents(metres)
 
 

@@ -23,7 +23,6 @@ from .shading import Bones, Dots, Moving, Shape, Solid, own_color, render
 from .sheets import contact_sheet
 from .thinning import of_vertices, thin_solid
 
-FORMAT = 1                           # version that the viewer checks
 SCENE = "picture.scene"              # file beside a picture, for the page of many results
 SMALL = 8000                         # triangles of a shape in it: 20 of them fit on a page
 MOST_TURN, MOST_BYTES = 20, 4_000_000        # figures that turn on a page of many, and their bytes
@@ -63,7 +62,8 @@ def picture_panes(panes: Sequence[Pane], height: int, columns: int | None = None
 def pack_scene(panes: Sequence[Pane], whole: bool = False) -> bytes:
     """Pack panes into bytes; `whole` keeps all triangles, for bodies whose vertices will be moved."""
     columns = _Columns()
-    header = {"format": FORMAT, "panes": [
+    # version that the viewer checks
+    header = {"format": 1, "panes": [
         {"label": pane.label, "camera": _camera(pane.camera), "origin": pane.camera.target.tolist(),
          "layers": [_layer(shape, pane.camera.target, columns, whole) for shape in pane.shapes]} for pane in panes]}
     text = json.dumps({**header, "columns": columns.described}, allow_nan=False).encode()

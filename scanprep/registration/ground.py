@@ -23,7 +23,6 @@ from .matches import NORMALS, tukey
 from .nonrigid import Registration
 from .person import PersonParts
 
-NEAR = 0.04                  # metres: scan points nearer than this to the skin of the feet belong to them
 FLAT = 0.002                 # metres: how flat a cut is; its points lie this near to the plane
 REACH = 0.015                # metres along the floor from the outline of a foot to where the scan ends
 WALL = 0.006                 # metres above the floor where the outline of the feet is taken, above any sole
@@ -134,7 +133,8 @@ def find_floor(body: Mesh, feet: np.ndarray, points: np.ndarray, normals: np.nda
     x = body.vertices
     if not feet.any() or feet.all() or not len(points):
         return None
-    at_feet = cKDTree(x[feet]).query(points, distance_upper_bound=NEAR)[0] < NEAR
+    sole_reach = 0.04  # metres: scan points nearer than this to the skin of the feet belong to them
+    at_feet = cKDTree(x[feet]).query(points, distance_upper_bound=sole_reach)[0] < sole_reach
     near, normals = points[at_feet], normals[at_feet]
     floor = _supporting_plane(near, x[feet].mean(axis=0), x[~feet].mean(axis=0))
     # at most 0.5% of the points at the feet may lie behind the floor: specks

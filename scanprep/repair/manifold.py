@@ -8,8 +8,6 @@ from ..geometry.sanitise import invert_against_neighbours, invert_triangles
 from ..geometry.sparse import label_components
 from ..geometry.surface import Rays
 
-FLAT = 1e-12               # square metres; triangles with less area are degenerate
-
 
 def repair(mesh: Mesh, min_component: float = 1.0) -> Mesh:
     """Repair a mesh to a manifold without duplicate, degenerate or unused elements and small components.
@@ -69,8 +67,9 @@ def weld(mesh: Mesh, distance: float = 0.0) -> Mesh:
 
 def _drop_flat(mesh: Mesh) -> Mesh:
     """Remove degenerate triangles by collapsing their shortest side; what is left after ten rounds is dropped."""
+    least_area = 1e-12  # square metres; triangles with less area are degenerate
     for _ in range(10):
-        flat = np.flatnonzero(mesh.face_areas < FLAT)
+        flat = np.flatnonzero(mesh.face_areas < least_area)
         if not len(flat):
             return mesh
         corners = mesh.corners[flat]
@@ -81,7 +80,7 @@ def _drop_flat(mesh: Mesh) -> Mesh:
         moved = mesh.vertices[target[target]]
         faces = target[target][mesh.faces]
         mesh = weld(Mesh(moved, faces, mesh.colors))
-    return mesh.submesh(mesh.face_areas >= FLAT)[0]
+    return mesh.submesh(mesh.face_areas >= least_area)[0]
 
 
 def orient_triangles(mesh: Mesh) -> Mesh:

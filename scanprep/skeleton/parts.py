@@ -11,7 +11,6 @@ from .motions import Moments, Motions, PosedSurface, agglomerate, fit_motions, h
 from .sides import Sides, cover, mirror_pairs
 from .symmetry import Symmetry
 
-SMALLEST = 0.005                 # share of the surface: a smaller part is merged with a neighbour
 FADING = 0.8                     # a part dissolves when a blend of its neighbours explains this share of its motion
 
 
@@ -59,6 +58,8 @@ class PartSearch:
 
     The generator places the initial patches.
     """
+
+    SMALLEST = 0.005                 # share of the surface: a smaller part is merged with a neighbour
 
     def __init__(self, surface: PosedSurface, config: SkeletonConfig, symmetry: Symmetry | None = None,
                  rng: np.random.Generator | None = None) -> None:
@@ -171,7 +172,7 @@ class PartSearch:
         while True:
             pairs, separation, extra = self.separations(label)
             share = np.bincount(label, self.surface.face_weights)
-            open_ = (share[pairs] < SMALLEST).any(axis=1) | (separation < self.config.separation)
+            open_ = (share[pairs] < self.SMALLEST).any(axis=1) | (separation < self.config.separation)
             for i in np.flatnonzero(open_)[np.argsort(extra[open_], kind="stable")]:
                 joined = self.alternate(self.join(label, *pairs[i]), rounds=2)
                 if joined.max() < label.max():
@@ -215,7 +216,7 @@ class PartSearch:
         weights = s.face_weights[inside]
         for _ in range(4):
             shares = np.bincount(local[inside] - 1, weights)
-            if len(shares) < (4 if two else 2) or shares.min() < SMALLEST:
+            if len(shares) < (4 if two else 2) or shares.min() < self.SMALLEST:
                 return local, 0.0
             motions = fit_motions(s.moments(local)[1:])
             partner = sides.partners(local)[1:] - 1 if sides.tied else np.arange(len(shares))

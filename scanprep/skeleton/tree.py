@@ -11,8 +11,6 @@ from scipy.sparse import coo_array, csr_array
 from ..geometry import rotations, storage
 from ..geometry.mesh import Mesh
 
-VERSION = 1              # of the file format
-
 
 @dataclass(frozen=True, eq=False)
 class Skeleton:
@@ -43,6 +41,8 @@ class Skeleton:
     >>> skeleton.part_rotations(np.zeros((2, 3))).shape
     (2, 3, 3)
     """
+
+    VERSION = 1              # of the file format
 
     part_of_face: np.ndarray
     parents: np.ndarray
@@ -175,7 +175,7 @@ class Skeleton:
     def save(self, path: str | Path) -> None:
         """Write the skeleton as JSON."""
         storage.write_json(path, {
-            "kind": "skeleton", "version": VERSION, "names": list(self.names), "parents": self.parents.tolist(),
+            "kind": "skeleton", "version": self.VERSION, "names": list(self.names), "parents": self.parents.tolist(),
             "joints": self.joints.tolist(), "part_of_face": self.part_of_face.tolist()})
 
     @staticmethod
@@ -184,9 +184,9 @@ class Skeleton:
         stored = storage.read_json(path, "a skeleton")
         if not isinstance(stored, dict) or stored.get("kind") != "skeleton":
             raise storage.StorageError(f"{path}: expected a skeleton in JSON, found something else")
-        if stored.get("version") != VERSION:
+        if stored.get("version") != Skeleton.VERSION:
             raise storage.StorageError(f"{path}: skeleton version {stored.get('version')} is not known here "
-                                       f"(known: {VERSION})")
+                                       f"(known: {Skeleton.VERSION})")
         with storage.taking_apart(path, "a whole skeleton"):
             return Skeleton(stored["part_of_face"], stored["parents"], stored["joints"], tuple(stored["names"]))
 

@@ -17,7 +17,6 @@ import numpy as np
 from ..geometry import storage
 
 STORED = Path(__file__).with_name("people.npz")
-VERSION = 1                            # of that file
 PARTS = ("pelvis", "abdomen", "chest", "head",
          "upper_arm_left", "forearm_left", "hand_left", "upper_arm_right", "forearm_right", "hand_right",
          "thigh_left", "shin_left", "foot_left", "thigh_right", "shin_right", "foot_right")
@@ -68,7 +67,8 @@ class Population:
 @lru_cache(maxsize=1)
 def population() -> Population:
     """Read the built-in people, once per process."""
-    header, a = storage.load(STORED, "people", (VERSION,))
+    # of that file
+    header, a = storage.load(STORED, "people", (1,))
     mirror = a["mirror"].astype(np.int64)
     count, swap = len(mirror), MIRROR_PART
     twin = np.concatenate([mirror, count + swap, count + 16 + swap, [count + 32]])

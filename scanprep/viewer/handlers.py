@@ -24,10 +24,7 @@ from .tabs import Tab, Tabs
 
 LARGEST_MESSAGE = 2**24              # bytes: clicks and sliders need a few hundred
 LARGEST_FILE = 2**30                 # bytes of a dropped file; larger scans are named on the command line
-TOO_LARGE = f"a file of more than {LARGEST_FILE} bytes"
 PIECE = 2**20                        # bytes of a download in memory at a time
-# names that tabs give themselves
-TAB = re.compile(r"[\w-]{8,64}", re.ASCII)
 
 
 class Serving(Protocol):
@@ -145,12 +142,15 @@ class PageHandler(Guarded):
 class Socket(Guarded, WebSocketHandler):
     """The connection of one tab."""
 
+    # names that tabs give themselves
+    TAB = re.compile(r"[\w-]{8,64}", re.ASCII)
+
     acts = True
 
     def prepare(self) -> None:
         super().prepare()
         self.tab_name = self.get_query_argument("tab", "")
-        if not TAB.fullmatch(self.tab_name):
+        if not self.TAB.fullmatch(self.tab_name):
             raise RefusedError(400, "expected the name of a tab")
 
     def get_websocket_protocol(self) -> Any:
@@ -200,6 +200,8 @@ class Socket(Guarded, WebSocketHandler):
 class Drop(Guarded):
     """A file dropped on the page, written to a temporary folder as it arrives."""
 
+    TOO_LARGE = f"a file of more than {LARGEST_FILE} bytes"
+
     acts = True
 
     def prepare(self) -> None:
@@ -214,7 +216,7 @@ class Drop(Guarded):
             raise RefusedError(400, str(problem)) from None
         # refuse by the announced size; what really comes is counted too
         if expected > LARGEST_FILE:
-            raise RefusedError(413, TOO_LARGE)
+            raise RefusedError(413, self.TOO_LARGE)
         self.request.connection.set_max_body_size(LARGEST_FILE + PIECE)     # type: ignore[union-attr]
         self.folder = Path(tempfile.mkdtemp(dir=self.server.dropped))
         self.out = open(self.folder / self.name, "wb")
@@ -225,7 +227,7 @@ class Drop(Guarded):
             return
         self.size += len(chunk)
         if self.size > LARGEST_FILE:
-            self._fail(413, TOO_LARGE)
+            self._fail(413, self.TOO_LARGE)
             return
         try:
             self.out.write(chunk)

@@ -14,8 +14,6 @@ from typing import Any
 
 from ..geometry import storage
 
-# length of the header: 4 bytes
-LENGTH = struct.Struct("<I")
 # keys of a header and their types
 KEYS = {"kind": str, "latest": str, "number": int, "fields": dict}
 
@@ -38,6 +36,9 @@ class Message:
         Number among the messages of its tab, set by the tab's connection; 0 for none.
     """
 
+    # length of the header: 4 bytes
+    LENGTH = struct.Struct("<I")
+
     kind: str
     fields: Mapping[str, Any] = field(default_factory=dict)
     data: bytes = b""
@@ -50,20 +51,21 @@ class Message:
                   "fields": storage.as_json(dict(self.fields))}
         text = json.dumps(header, allow_nan=False, separators=(",", ":")).encode("utf-8")
         # data begin at a multiple of 8 bytes, which the largest number type needs
-        text += b" " * (-(len(text) + LENGTH.size) % 8)
-        return LENGTH.pack(len(text)) + text + self.data
+        text += b" " * (-(len(text) + self.LENGTH.size) % 8)
+        return self.LENGTH.pack(len(text)) + text + self.data
 
     @classmethod
     def unpack(cls, raw: bytes | str) -> Message:
         """Unpack the message of a frame; ValueError for anything else."""
         if isinstance(raw, str):
             raise ValueError(f"message: expected a binary frame, got text of {len(raw)} characters")
-        if len(raw) < LENGTH.size:
-            raise ValueError(f"message: expected at least {LENGTH.size} bytes, got {len(raw)}")
-        end = LENGTH.size + LENGTH.unpack_from(raw)[0]
+        if len(raw) < cls.LENGTH.size:
+            raise ValueError(f"message: expected at least {cls.LENGTH.size} bytes, got {len(raw)}")
+        end = cls.LENGTH.size + cls.LENGTH.unpack_from(raw)[0]
         if end > len(raw):
-            raise ValueError(f"message: expected a header of {end - LENGTH.size} bytes, got {len(raw) - LENGTH.size}")
-        header = storage.parse_json("message", bytes(raw[LENGTH.size:end]), "a header")
+            start = cls.LENGTH.size
+            raise ValueError(f"message: expected a header of {end - start} bytes, got {len(raw) - start}")
+        header = storage.parse_json("message", bytes(raw[cls.LENGTH.size:end]), "a header")
         _check(header)
         return cls(data=bytes(raw[end:]), **header)
 

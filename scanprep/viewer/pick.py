@@ -29,7 +29,6 @@ from .messages import Message
 from .worker import Stopped
 
 TEMPLATE, SCAN = 0, 1                # numbers of the panes on the page
-ENOUGH = 4                           # landmarks needed to predict the others: errors were measured with four
 
 
 @dataclass(frozen=True)
@@ -44,6 +43,8 @@ class Change:
 
 class PickApp:
     """The state of `scape pick`: a template, scans one after the other, names, and changes to undo."""
+
+    ENOUGH = 4                           # landmarks needed to predict the others: errors were measured with four
 
     name, title = "pick", "Landmarks"
     folders: Sequence[Path] = ()
@@ -97,7 +98,7 @@ class PickApp:
         template, body = self.template.body.points, self.scan.body.shape
         # names may be spelt differently on scan and template, so they are paired by meaning
         landmarks = None
-        if len(pairs) >= ENOUGH:
+        if len(pairs) >= self.ENOUGH:
             landmarks = (np.array([self.template.places[on_template] for on_template, _ in pairs]),
                          np.array([self.scan.places[on_scan] for _, on_scan in pairs]))
         return replace(pane, camera=camera_like(camera_of(self.template.body.shape), template, body, landmarks))
@@ -112,7 +113,7 @@ class PickApp:
                           for one in shown],
                 "scan": self.current,
                 "scans": [{"name": one.path.name, "count": len(one.places)} for one in self.scans],
-                "undo": bool(self.done), "redo": bool(self.undone), "working": self.working, "enough": ENOUGH,
+                "undo": bool(self.done), "redo": bool(self.undone), "working": self.working, "enough": self.ENOUGH,
                 "question": self.question, **self.more()}, latest="state")
 
     def more(self) -> dict[str, Any]:
@@ -320,15 +321,16 @@ class PickApp:
         scan = self.scan
         if pane == SCAN and scan is not None and not scan.predicted and self.working is None:
             common = [name for name in self.template.places if name in scan.places]
-            if len(common) == ENOUGH < len(self.template.places):
+            if len(common) == self.ENOUGH < len(self.template.places):
                 self._predict(scan, send)
 
     def _predict(self, clicked: Clicked, send: Send) -> None:
         """Predict the missing landmarks of a scan in a thread of its own."""
         common = [name for name in self.template.places if name in clicked.places]
         template = self.template.body.shape
-        if len(common) < ENOUGH:
-            raise ValueError(f"click {ENOUGH} landmarks that the template has too, then the others can be predicted")
+        if len(common) < self.ENOUGH:
+            raise ValueError(
+                f"click {self.ENOUGH} landmarks that the template has too, then the others can be predicted")
         if self.working is not None or not isinstance(template, Mesh):
             return
         on_template, on_scan, body = dict(self.template.places), dict(clicked.places), clicked.body

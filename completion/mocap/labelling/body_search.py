@@ -22,14 +22,11 @@ from ..pose.marked_body import MarkedBody
 
 ALONE = 0.8                          # cost of a marker without a point; a match costs 1/2 at its scale, at most 1
 JUDGED = 0.08                        # metres: scale of the matches by which the misfit of a frame is judged
-TURNS = 16                           # orientations about the long axis of the body
 FIRST, REST = 2, 6                   # rounds of rigid alignment for all candidates, and for the promising ones
-PROMISING = 300                      # candidates with the least cost after the first rounds
 SD = 0.03                            # metres: on the mean person markers fit only roughly
 # For each round of solves: scale of the matches, metres, and weight of the pose prior; both decrease.
 ROUNDS = ((0.3, 3.0), (0.2, 3.0), (0.2, 1.0), (0.15, 1.0), (0.12, 1.0), (0.1, 1.0), (0.1, 1.0))
 LIMB_ROUNDS = ((0.2, 1.0), (0.12, 1.0), (0.1, 1.0))
-LIMB_POSES = 8                       # poses that are tried for each limb
 Axis = tuple[float, float, float]
 UPS: tuple[Axis, ...] = ((0.0, 0.0, 1.0), (0.0, 1.0, 0.0))             # up axes of files
 # If nobody stands: upside down, and lying along ten directions.
@@ -90,6 +87,9 @@ class BodySearch:
         The same body; its template stands upright.
     """
 
+    TURNS = 16                           # orientations about the long axis of the body
+    LIMB_POSES = 8                       # poses that are tried for each limb
+
     def __init__(self, body: MarkedBody, subject: Subject) -> None:
         self.body = body
         fixed = body.body
@@ -131,9 +131,9 @@ class BodySearch:
         """Return unknowns (n, P) of all poses and orientations, and their markers (n, L, 3), centred at the origin."""
         if along not in self._laid:
             body, axis = self.body, np.asarray(along) / np.linalg.norm(along)
-            turn = np.arange(TURNS)[:, None] * 2 * np.pi / TURNS * axis
+            turn = np.arange(self.TURNS)[:, None] * 2 * np.pi / self.TURNS * axis
             turns = rotations.exp(turn) @ rotation_between(self.upright, axis)
-            poses = np.repeat(self.poses, TURNS, axis=0)
+            poses = np.repeat(self.poses, self.TURNS, axis=0)
             poses[:, 0] = rotations.log(np.tile(turns, (len(self.poses), 1, 1)) @ rotations.exp(poses[:, 0]))
             x = body.body.join(poses, np.zeros((len(poses), 3)))
             at = np.concatenate([body.positions(x[i:i + 256]) for i in range(0, len(x), 256)])
@@ -163,7 +163,7 @@ class BodySearch:
 
     def restart_limbs(self, placement: Placement, points: np.ndarray, judged: float) -> Placement:
         """Try other poses for one limb after the other, since a foot may be reversed; return the best placement."""
-        limb_poses = self.poses[np.random.default_rng(0).permutation(len(self.poses))[:LIMB_POSES]]
+        limb_poses = self.poses[np.random.default_rng(0).permutation(len(self.poses))[:self.LIMB_POSES]]
         for limb in self.limbs:
             x = np.repeat(placement.x[None], len(limb_poses), axis=0)
             for joint in limb:
@@ -190,7 +190,8 @@ def lay_rigidly(at: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndar
     for rounds in (FIRST, REST):
         for some in np.array_split(rows, max(1, len(rows) // 128)):     # 128 at once fit into the cache
             R[some], t[some], scores[some] = _closest_points(at[some], points, R[some], t[some], rounds)
-        rows = np.argsort(scores)[:PROMISING]
+        # candidates with the least cost after the first rounds
+        rows = np.argsort(scores)[:300]
     return R, t, np.where(np.isin(np.arange(B), rows), scores, np.inf)
 
 

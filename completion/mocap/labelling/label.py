@@ -35,7 +35,6 @@ FOUND = 0.3                          # largest misfit of a frame with a body; co
 # Least standard deviation, metres, of a marker from its place in each direction, in the last three passes.
 DEVIATIONS = (0.03, 0.02, 0.012)
 SURE = 0.9                           # confidence below which a label is doubtful
-POSES = AnimateConfig(marker_sd=0.007)                                  # metres: markers at known places, as in `mosh`
 
 
 @dataclass(frozen=True, eq=False)
@@ -239,6 +238,8 @@ def label_people(people: Sequence[tuple[BodyModel | Subject, MarkerLayout]], poi
 class _Person:
     """A person, the usual layout, and the body with markers, as known so far."""
 
+    POSES = AnimateConfig(marker_sd=0.007)                               # metres: markers at known places, as in `mosh`
+
     subject: Subject
     layout: MarkerLayout
     usual: MarkerLayout
@@ -260,7 +261,7 @@ class _Person:
 
     def follow(self, points: np.ndarray, columns: np.ndarray, rate: float) -> _Moving:
         """Compute the motion for the labels in columns (T, L)."""
-        motion = animate(self.subject, _sequence(points, columns, self.layout, rate), self.layout, POSES)
+        motion = animate(self.subject, _sequence(points, columns, self.layout, rate), self.layout, self.POSES)
         x = self.marked.body.join(motion.poses, motion.trans)
         turns = self.marked.shapes.rotations(np.swapaxes(motion.poses, 0, 1))[self.part]
         return _Moving(motion, self.marked.positions(x), np.swapaxes(turns, 0, 1))

@@ -9,8 +9,6 @@ from .live_matching import find_unmatched
 
 WINDOW, LONG = 0.1, 2.0              # seconds: time constants of the strain, and of the usual strain
 # strain above the usual, in markers, at which a limb is searched; a reversed foot had 1.3 to 1.9, a right one below 0.8
-WORSE = 0.8
-POSES = 8                            # poses tried for a limb, half of them only below its second joint
 PATIENCE, LONGEST = 0.25, 4.0        # seconds from a search without success to the next, doubled up to LONGEST
 
 
@@ -21,6 +19,9 @@ class LimbWatch:
     ----------
     search : BodySearch
     """
+
+    WORSE = 0.8
+    POSES = 8                            # poses tried for a limb, half of them only below its second joint
 
     def __init__(self, search: BodySearch) -> None:
         self.search = search
@@ -65,7 +66,7 @@ class LimbWatch:
         """Return a mask (L,) of markers on limbs that fit worse than usual."""
         doubted = np.zeros(len(self.strain), dtype=bool)
         for rows, worse in zip(self.rows, self._of_limbs(self.strain) - self.usual, strict=True):
-            doubted[rows] = worse > WORSE
+            doubted[rows] = worse > self.WORSE
         return doubted
 
     def seek(self, x: np.ndarray, points: np.ndarray) -> tuple[Placement, np.ndarray, list[int]] | None:
@@ -77,7 +78,7 @@ class LimbWatch:
         strain, shown = self._of_limbs(self.strain), self._of_limbs(self.cost)
         worse = np.where((self.quiet > 0) | (shown < strain), -np.inf, strain - self.usual)
         limb = int(worse.argmax())
-        if worse[limb] < WORSE:
+        if worse[limb] < self.WORSE:
             return None
         now = self.search.judge(x, points, OWN_PERSON.judged)
         found = self.search.refine(self._starts(x, limb), points, LIMB_ROUNDS, OWN_PERSON.judged)
@@ -91,7 +92,7 @@ class LimbWatch:
 
     def _starts(self, x: np.ndarray, limb: int) -> np.ndarray:
         """Return unknowns (n, P) with other poses of a limb, half of them only at its end."""
-        poses = np.roll(self.order, -POSES * self.tries, axis=0)[:POSES]
+        poses = np.roll(self.order, -self.POSES * self.tries, axis=0)[:self.POSES]
         self.tries += 1
         starts = np.repeat(x[None], len(poses), axis=0)
         for depth, joint in enumerate(self.search.limbs[limb]):

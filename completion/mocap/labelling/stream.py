@@ -17,7 +17,6 @@ from .limb_watch import LimbWatch
 from .live_matching import SEEN_SD, Expected, certainty, intersect, match, shift_groups
 from .tracks import ACCELERATION, BRIDGE
 
-FORGOTTEN = 0.25                     # seconds out of sight after which the offset of a marker is forgotten
 ROUNDS = 3                           # most rounds of matching and solving; one is enough without doubtful labels
 LABELS, GONE = 4, 0.5                # a body with fewer labels for that many seconds is gone
 STRAINED, LOST = 0.2, 0.5            # mean strain above which the body is searched again, and above which it is lost
@@ -273,6 +272,8 @@ class LabelStream:
 class _Memory:
     """Memory of each marker: last point, velocity, offset from the body."""
 
+    FORGOTTEN = 0.25                     # seconds out of sight after which the offset of a marker is forgotten
+
     def __init__(self, count: int, rate: float) -> None:
         self.bridge = max(BRIDGE, 1.5 / rate)                           # seconds of extrapolation by constant velocity
         self.unseen = np.full(count, np.inf)                            # seconds since the last point
@@ -285,12 +286,12 @@ class _Memory:
 
     def offsets(self) -> np.ndarray:
         """Return offsets (L, 3), metres, of points from simulated markers, fading while a marker is out of sight."""
-        return np.exp(-self.unseen / FORGOTTEN)[:, None] * self.off
+        return np.exp(-self.unseen / self.FORGOTTEN)[:, None] * self.off
 
     def spread(self) -> np.ndarray:
         """Compute the variance (L,), m², of each point about its simulated marker plus offset."""
         worn_sd = 0.025  # metres: standard deviation of a point whose offset is unknown
-        return np.minimum(SEEN_SD**2 + worn_sd**2 * self.unseen / FORGOTTEN, worn_sd**2)
+        return np.minimum(SEEN_SD**2 + worn_sd**2 * self.unseen / self.FORGOTTEN, worn_sd**2)
 
     def with_tracks(self, expected: Expected) -> Expected:
         """Combine predictions by the body with extrapolation at constant velocity, for recently seen markers."""
@@ -308,7 +309,7 @@ class _Memory:
         rows = np.flatnonzero(chosen >= 0)
         at, dt = points[chosen[rows]], self.unseen[rows]
         # 0.015 s: time constant over which offsets are averaged
-        share = np.where(dt < FORGOTTEN, 1 - np.exp(-dt / 0.015), 1.0)[:, None]
+        share = np.where(dt < self.FORGOTTEN, 1 - np.exp(-dt / 0.015), 1.0)[:, None]
         self.off[rows] += share * (at - places[rows] - self.off[rows])
         self.moving[rows] = dt < self.bridge
         self.velocity[rows] = (at - self.last[rows]) / dt[:, None]

@@ -32,7 +32,6 @@ CLOSER = PersonConfig(frames=24, pose=0.02)
 ROUNDS = 5                           # fits, each starting from the places of the one before; 2 left 4 mm more
 NAMED = 4                            # fits in which markers of a known marker set are held to its places
 LIKE = 0.10                          # metres: largest distance of a marker from the place of a known set
-LONG = 0.3                           # least share of the frames in which a track has to be seen
 OUTLIER = 0.06                       # metres beyond which the distance of a track from a place does not matter
 
 
@@ -195,25 +194,28 @@ def _snap(layout: MarkerLayout, labels: dict[str, str], usual: MarkerLayout) -> 
 def long_tracks(points: MarkerSequence) -> MarkerSequence:
     """Return the long tracks of a recording: its columns, or pieces that its points were joined to."""
     fewest = 10  # least number of tracks
+    least_share = 0.3  # least share of the frames in which a track has to be seen
     if not has_tracks(points.positions, points.rate):
         number = link_points(points.positions, points.rate)
         frames, columns = np.nonzero(number >= 0)
         which = number[frames, columns]
         counts = np.bincount(which, minlength=number.max() + 1)
-        kept = np.flatnonzero(counts >= LONG * len(number))
+        kept = np.flatnonzero(counts >= least_share * len(number))
         if len(kept) < fewest:
-            raise ValueError(f"points: expected at least {fewest} tracks that are seen in {100 * LONG:.0f}% of the "
-                             f"frames, found {len(kept)}; without tracks a layout has to be given")
+            raise ValueError(
+                f"points: expected at least {fewest} tracks that are seen in {100 * least_share:.0f}% of the frames, "
+                f"found {len(kept)}; without tracks a layout has to be given")
         series = np.full((len(number), len(kept), 3), np.nan)
         place = np.full(number.max() + 1, -1)
         place[kept] = np.arange(len(kept))
         of_kept = place[which] >= 0
         series[frames[of_kept], place[which[of_kept]]] = points.positions[frames[of_kept], columns[of_kept]]
         return MarkerSequence(series, tuple(f"track{k}" for k in kept), points.rate)
-    long = points.seen.mean(axis=0) >= LONG
+    long = points.seen.mean(axis=0) >= least_share
     if long.sum() < fewest:
-        raise ValueError(f"points: expected at least {fewest} tracks that are seen in {100 * LONG:.0f}% of the frames, "
-                         f"found {int(long.sum())}")
+        raise ValueError(
+            f"points: expected at least {fewest} tracks that are seen in {100 * least_share:.0f}% of the frames, "
+            f"found {int(long.sum())}")
     return points.select([label for label, is_long in zip(points.labels, long, strict=True) if is_long])
 
 

@@ -12,8 +12,6 @@ from scanprep.geometry.least_squares import Dense
 from .marked_body import MarkedBody, point_system, stretches
 from .part_shapes import part_shapes
 
-TOUCH = 0.025                        # metres: a point may stand when it is this close to the floor
-
 
 @dataclass(frozen=True, eq=False)
 class Floor:
@@ -61,6 +59,8 @@ class FootContact:
     The floor is that of `AnimateConfig.floor`, or is estimated below the body.
     """
 
+    TOUCH = 0.025                        # metres: a point may stand when it is this close to the floor
+
     def __init__(self, body: MarkedBody, x: np.ndarray, rate: float,
                  floor: tuple[float, float, float, float] | None = None) -> None:
         self.body, subject = body, body.body.subject
@@ -71,7 +71,7 @@ class FootContact:
         # the soles: at most 24 vertices spread over all that come near the floor in 5% of the frames, and the lowest
         # vertex of every frame, as heels are round
         rest, height = subject.template.vertices, self.floor.above(vertices)
-        near = np.flatnonzero((height < TOUCH).mean(axis=0) > 0.05)
+        near = np.flatnonzero((height < self.TOUCH).mean(axis=0) > 0.05)
         near = near if len(near) else np.array([int(height.min(axis=0).argmin())])
         spread = farthest_points(rest[near], 24, height[:, near].mean(axis=0).argmin())
         self.shapes = part_shapes(subject.points(near[np.union1d(spread, height[:, near].argmin(axis=1))]))
@@ -109,7 +109,7 @@ class FootContact:
         # positions are averaged over 0.15 s for their speed; a point stands for at least 0.08 s, below 0.2 m/s
         calm = uniform_filter1d(points, max(1, round(0.15 * rate)), axis=0, mode="nearest")
         speed = np.linalg.norm(np.gradient(calm, axis=0), axis=2) * rate
-        stands = (self.floor.above(calm) < TOUCH) & (speed < 0.2)
+        stands = (self.floor.above(calm) < self.TOUCH) & (speed < 0.2)
         for k in range(points.shape[1]):
             for stretch in stretches(np.flatnonzero(stands[:, k])):
                 # the place is the median over the stretch, lifted out of the floor

@@ -15,8 +15,6 @@ from .marked_body import AnimateConfig, MarkedBody, judge_markers, marker_misfit
 from .swaps import LabelWatch
 
 STEPS = 3                            # most Gauss-Newton steps for a frame
-LOST = 0.08                          # metres: median residual above which a frame is searched from scratch
-PATIENCE = 0.25                      # seconds from a search without success to the next; doubled each time
 
 
 @dataclass(frozen=True, eq=False)
@@ -168,11 +166,14 @@ class KalmanPrediction:
 class MarkerTracker:
     """State of a stream of markers (L, 3) that all belong to the body, `rate` frames a second."""
 
+    LOST = 0.08                          # metres: median residual above which a frame is searched from scratch
+    PATIENCE = 0.25                      # seconds from a search without success to the next; doubled each time
+
     def __init__(self, body: MarkedBody, config: AnimateConfig, rate: float, steps: int = STEPS) -> None:
         self.body, self.config, self.rate, self.steps = body, config, rate, steps
         self.watch = LabelWatch(body.count, config.outlier)
         self.prediction = KalmanPrediction(body, config, rate)
-        self.wait, self.patience, self.started = 0, PATIENCE * rate, False
+        self.wait, self.patience, self.started = 0, self.PATIENCE * rate, False
         self.places = np.full((body.count, 3), np.nan)                  # simulated markers of the last frame
         self.believed, self.since, self.passed = False, 0, 0            # frames since a plausible one; frames ignored
         self.leapt = self.places                                        # simulated markers of the last solution
@@ -211,7 +212,7 @@ class MarkerTracker:
         # search from scratch where the body has lost its markers, or a fifth of the visible ones
         away = np.linalg.norm(self.places - taken, axis=1)
         away = away[~np.isnan(away)]
-        astray = bool(np.median(away) > LOST or (away > self.config.outlier).mean() > 0.2)
+        astray = bool(np.median(away) > self.LOST or (away > self.config.outlier).mean() > 0.2)
         if not self.wait and enough and not fresh and astray:
             found = self._search_again(taken)
             x, converged = (x, converged) if found is None else (found, True)
@@ -250,7 +251,7 @@ class MarkerTracker:
         apart = np.linalg.norm(np.stack([self.body.positions(found), self.places]) - targets, axis=2)
         new, old = marker_misfit(apart, self.config.outlier)
         if new < 0.7 * old:
-            self.patience = PATIENCE * self.rate
+            self.patience = self.PATIENCE * self.rate
             return found
         self.wait, self.patience = round(self.patience), 2 * self.patience
         return None
@@ -262,8 +263,8 @@ class MarkerTracker:
         confirms it, or when it lasts.
         """
         # 10 m/s: most by which all markers together move away from the prediction
-        near = LOST + 10.0 * self.since / self.rate
-        lost = bool(np.nanmedian(np.linalg.norm(self.places - targets, axis=1)) > LOST)
+        near = self.LOST + 10.0 * self.since / self.rate
+        lost = bool(np.nanmedian(np.linalg.norm(self.places - targets, axis=1)) > self.LOST)
         leapt, self.leapt = self.leapt, np.full_like(before, np.nan) if lost else self.places
         # a median is NaN, and not below the limit, where some places are unknown
         self.believed = not lost and any(np.median(np.linalg.norm(self.places - of, axis=1)) <= near

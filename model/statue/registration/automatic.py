@@ -20,15 +20,11 @@ from ..control.model import ControlModel
 from .features import FeatureFit, fit_features
 from .person_search import find_stand
 
-SHOWN = 0.3                      # share of the vertices around a joint or landmark, or of a limb, that must have data
 # Largest distance, metres, of the posed body from a scan, and least ratio of that distance when it faces another way.
 # Six synthetic persons: 11 to 13 mm, ratio 1.7 to 3.3. Nine real ones, five of them bent: 18 to 21 mm, 1.5 to 2.9.
 # Fronts and sides alone: 21 mm, 1.35 to 1.6. A cylinder: 47 mm, 1.13; a chair: 56 mm; two people: 65 and 70 mm.
 OFF, MARGIN = 0.042, 1.05
 DOUBTED_OFF, DOUBTED_MARGIN = 0.025, 1.2         # a leg alone has 25 mm; dressed persons need a look
-# share of a scan off the fitted body that is doubtful: synthetic persons have 0.005, three dressed ones 0.09 to 0.26,
-# one with long hair 0.07
-MISSED = 0.05
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,10 +83,13 @@ def nobody_problem(off: float, margin: float, size: str) -> str | None:
 
 def why_uncertain(off: float, margin: float, missed: float) -> str | None:
     """Explain why features should not be trusted, as with a limb in a wrong place; None where they may be."""
+    # share of a scan off the fitted body that is doubtful: synthetic persons have 0.005, three dressed ones 0.09 to
+    # 0.26, one with long hair 0.07
+    most_missed = 0.05
     reasons = [text for text, wrong in (
         (f"the posed body stays {1000 * off:.0f} mm off the scan", off > DOUBTED_OFF),
         (f"facing another way it fits only {margin:.2f} times worse", margin < DOUBTED_MARGIN),
-        (f"{100 * missed:.0f}% of the scan lies off the registered one", missed > MISSED)) if wrong]
+        (f"{100 * missed:.0f}% of the scan lies off the registered one", missed > most_missed)) if wrong]
     return "; ".join(reasons) + ": look at it, or click" if reasons else None
 
 
@@ -113,7 +112,9 @@ def _features(control: ControlModel, found: Registration, scan: Mesh | np.ndarra
     x, seen = found.mesh.vertices, found.confidence
     centres = skeleton.joint_regressor(control.mesh) @ x / metres
     around = (near @ seen + seen) / (near.sum(axis=1) + 1)
-    shown = np.array([seen[skeleton.joint_weights(control.mesh, j)[0]].mean() > SHOWN for j in range(len(centres))])
+    least_shown = 0.3  # share of the vertices around a joint or landmark, or of a limb, that must have data
+    shown = np.array([seen[skeleton.joint_weights(control.mesh,
+                                                  j)[0]].mean() > least_shown for j in range(len(centres))])
     part = control.weights.argmax(axis=1)
     # a limb has data of its own only where its nearest scan points are not near the rest of the body as well. Otherwise
     # points of a thigh could count as a hand on it.
@@ -127,11 +128,11 @@ def _features(control: ControlModel, found: Registration, scan: Mesh | np.ndarra
             rest = found.mesh.submesh(~np.isin(of_face, limb))[0]
             # points within 2 cm of the rest of the body are not evidence of a limb
             own = Surface(rest).closest(nearest[of_limb]).distances > 0.02
-            shown[j] &= bool((own * seen[of_limb]).mean() > SHOWN)
+            shown[j] &= bool((own * seen[of_limb]).mean() > least_shown)
         shown[j] &= parent <= 0 or shown[parent]
     joints = {name: centres[j] for j, name in enumerate(skeleton.names) if shown[j]}
     places = x / metres
     points = {name: places[v] for name, v in control.landmarks.items()
-              if around[v] > SHOWN and (shown[part[v]] or part[v] == 0)}
+              if around[v] > least_shown and (shown[part[v]] or part[v] == 0)}
     lacking = tuple(name for name in (*skeleton.names, *control.landmarks) if name not in {*joints, *points})
     return joints, points, lacking
