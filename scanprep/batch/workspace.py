@@ -1,4 +1,4 @@
-"""An output folder and the records of it: what was written, what is complete, and what must be computed again.
+"""Resume: the records of an output folder say what is complete, and what must be computed again.
 
     OUTPUT/.scapekit/lock           held while a run is at work
                      making/        unfinished results; those of a killed run are removed at the next start
