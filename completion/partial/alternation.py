@@ -161,7 +161,7 @@ def solve_twists(skeleton: Skeleton, part: np.ndarray, e: np.ndarray, v: np.ndar
 
 
 def solve_in_turns(model: ScapeModel, surface_weight: float, fit: ScanFit, few: ScanFit, x: np.ndarray,
-                   tell: Callable[[int], None]) -> Solved:
+                   report_progress: Callable[[int], None]) -> Solved:
     """Alternate over R, Y and betas; in every round the scan points closest to Y[Z] become markers.
 
     Arguments and result are those of `solve_jointly`.
@@ -180,7 +180,7 @@ def solve_in_turns(model: ScapeModel, surface_weight: float, fit: ScanFit, few: 
         now = steps.solve_vertices(now, markers)                         # [SCAPE] Eq. 10
         now = steps.solve_shape(now)                                     # [SCAPE] §6
         shift = float(np.sqrt(((now.Y - before)**2).sum(axis=1).mean()))
-        tell(min(1 + i // MORE, config.rounds))
+        report_progress(min(1 + i // MORE, config.rounds))
         if i >= rounds and shift < SETTLED / MORE:
             break
     # back to the unknowns of the joint method: joint angles, place, betas

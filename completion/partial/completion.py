@@ -179,7 +179,7 @@ def complete(body: BodyModel | Subject, scan: Scan, landmarks: tuple[np.ndarray,
     if start is not None and config is not None and config.free_scale:
         raise ValueError("start: expected none where the unit of the scan is not known")
     # check the input and bring scan and landmarks into metres
-    config, tell = config or CompletionConfig(), progress or (lambda result, total: None)
+    config, report_progress = config or CompletionConfig(), progress or (lambda result, total: None)
     total, person = config.rounds + 3, as_body(body)
     solve = solve_jointly if config.method == "joint" else turns_of(body, config)
     inputs = prepare_in_metres(person, scan, landmarks, masked, config)
@@ -188,11 +188,11 @@ def complete(body: BodyModel | Subject, scan: Scan, landmarks: tuple[np.ndarray,
     # initialise: many starts with few points, the best ones with each limb tried in other poses
     sparse = fit.few()
     starts = going_on(fit, start.pose, start.trans, start.betas) if start else first_starts(fit, sparse)   # [SCAPE] §7
-    tell(1, total)
+    report_progress(1, total)
     x, rival = with_limbs(fit, sparse, best_starts(sparse, starts))
-    tell(2, total)
+    report_progress(2, total)
     # fit pose, shape and place to the scan
-    solved = solve(fit, sparse, x, lambda result: tell(2 + result, total))       # [SCAPE] Eq. 10, Eq. 11
+    solved = solve(fit, sparse, x, lambda result: report_progress(2 + result, total))       # [SCAPE] Eq. 10, Eq. 11
     x, factor = fit.body.in_metres(solved.x)
     open_error = factor * posterior_error(fit.body, solved.x, fit.precision(solved.x))
     inputs = inputs.scale_by(factor)
@@ -208,7 +208,7 @@ def complete(body: BodyModel | Subject, scan: Scan, landmarks: tuple[np.ndarray,
         completed, rms = predicted, distance_to(predicted, cloud.points[used])
     # the expected error of every vertex, and the residuals of the landmarks
     error = estimate_error(open_error, distance_to_seen(predicted, seen), rms, person.left_out_error)
-    tell(total, total)
+    report_progress(total, total)
     pose, trans, betas = person.split(x)
     shape = body.betas if isinstance(body, Subject) else betas if person.n_betas else None
     distances = np.linalg.norm(predicted.vertices[inputs.vertices] - inputs.points, axis=1)

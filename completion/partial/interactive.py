@@ -262,10 +262,10 @@ class CompleteApp(PickApp):
         start = made.completion if made is not None and on else None
         scan, known, places = self.scan, self.known, {name: self.scan.places[name] for name in names}
 
-        def work(tell: Callable[[int, int], None]) -> str:
+        def work(report_progress: Callable[[int, int], None]) -> str:
             begin, pairs = time.perf_counter(), pairs_of(places, self.work.marks)
             files = self._files(scan.path, pairs)
-            done, masked = self._find_body(scan, files, known, pairs, tell, start)
+            done, masked = self._find_body(scan, files, known, pairs, report_progress, start)
             with self._lock:
                 self.made[scan.path] = Made(done, files, time.perf_counter() - begin, places, known, masked)
                 self.saved.pop(scan.path, None)
@@ -282,9 +282,9 @@ class CompleteApp(PickApp):
             return
         scan, known, places = self.scan, self.known, {name: self.scan.places[name] for name in self._usable(self.scan)}
 
-        def work(tell: Callable[[int, int], None]) -> str:
+        def work(report_progress: Callable[[int, int], None]) -> str:
             files = self._files(scan.path, pairs_of(places, self.work.marks))
-            done, _ = self._find_body(scan, files, known, None, tell)
+            done, _ = self._find_body(scan, files, known, None, report_progress)
             if done.judgement.verdict == "failed":
                 return "the body is not found without landmarks either"
             with self._lock:
@@ -296,12 +296,12 @@ class CompleteApp(PickApp):
         self.beside("finding the body without the landmarks", work, send, "it could not be found")
 
     def _find_body(self, scan: Clicked, files: ScanFiles, known: bool, pairs: tuple[np.ndarray, np.ndarray] | None,
-                   tell: Callable[[int, int], None], start: Completion | None = None
+                   report_progress: Callable[[int, int], None], start: Completion | None = None
                    ) -> tuple[Completion, np.ndarray | None]:
         """Complete a scan; return the result and its points that are clothing or hair."""
         content, masked = self._load_input(scan.path), self._read_masks(scan, files)
         views = list(content.views) if isinstance(content, ScanFiles) else content
-        return complete(self._body(known), views, pairs, self.work.config, tell, masked, start), masked
+        return complete(self._body(known), views, pairs, self.work.config, report_progress, masked, start), masked
 
     def _body(self, known: bool) -> BodyModel | Subject:
         """Return the model, or the person of known shape, the template's own body by default."""

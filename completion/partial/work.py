@@ -52,12 +52,12 @@ class CompletionTask:
     colors: ColorConfig = field(default_factory=ColorConfig)
     command: str = field(default="", metadata={"digest": False})     # for the report of each scan of a folder
 
-    def __call__(self, inputs: CompletionInputs, room: TaskContext) -> list[Metric]:
+    def __call__(self, inputs: CompletionInputs, context: TaskContext) -> list[Metric]:
         """Complete one scan and return its figures."""
         start = time.perf_counter()
-        metrics = complete_files(self, inputs, room)
+        metrics = complete_files(self, inputs, context)
         if self.command:
-            write_report(Outcome(room.folder, metrics, {"complete": self.config}, judgement=judgement_of(metrics)),
+            write_report(Outcome(context.folder, metrics, {"complete": self.config}, judgement=judgement_of(metrics)),
                          self.command, time.perf_counter() - start)
         return metrics
 
@@ -90,7 +90,7 @@ class ScanFiles:
         return only if isinstance(only, Mesh) else None
 
 
-def complete_files(work: CompletionTask, inputs: CompletionInputs, room: TaskContext) -> list[Metric]:
+def complete_files(work: CompletionTask, inputs: CompletionInputs, context: TaskContext) -> list[Metric]:
     """Complete one scan into the folder of a task, with its report.html; return the figures, the judgement first."""
     unit = "m" if work.config.free_scale else work.unit            # "m": numbers as they are in the files
     depth = read_picture(inputs.scans, work.unit)
@@ -106,10 +106,10 @@ def complete_files(work: CompletionTask, inputs: CompletionInputs, room: TaskCon
         files = person_in(depth, work.body.template, landmarks)
     # complete, which is kept for a later run, and write everything
     scan = list(files.views) if depth is None else depth
-    done = room.step("completion", (work.body, work.marks, work.config, work.unit, inputs),
-                     lambda: complete(work.body, scan, landmarks, work.config, room.tell, masked))
-    return [*write_results(work, inputs, files, done, landmarks, masked, room.folder),
-            *write_clicked_markers(room.folder, done, extra_markers(named, work.marks))]
+    done = context.step("completion", (work.body, work.marks, work.config, work.unit, inputs),
+                        lambda: complete(work.body, scan, landmarks, work.config, context.report_progress, masked))
+    return [*write_results(work, inputs, files, done, landmarks, masked, context.folder),
+            *write_clicked_markers(context.folder, done, extra_markers(named, work.marks))]
 
 
 def write_results(work: CompletionTask, inputs: CompletionInputs, files: ScanFiles, done: Completion,

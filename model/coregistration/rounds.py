@@ -94,7 +94,7 @@ class RegisterWithModel:
         """The template's own body, made once for all scans."""
         return self.model.subject()
 
-    def __call__(self, one: OneScan, room: TaskContext) -> ModelRegistration:
+    def __call__(self, one: OneScan, context: TaskContext) -> ModelRegistration:
         body = self.person if one.own or not self.model.n_betas else self.model
         return register_with_model(body, one.scan, one.landmarks, one.start, self.config)
 
@@ -229,14 +229,14 @@ def _register_round(space: Workspace, model: BodyModel, scans: Sequence[OneScan]
                     config: CoregistrationConfig, turn: int, progress: Progress | None
                     ) -> tuple[list[ModelRegistration | None], dict[str, str]]:
     """Register all scans once; return registrations in the order of the scans, and failures by name."""
-    def tell(done: int, total: int) -> None:
+    def report_progress(done: int, total: int) -> None:
         if progress is not None:
             progress(turn * total + done, config.rounds * total)
 
     tasks = {name: Task(task_name(turn, name), scan) for name, scan in zip(names, scans, strict=True)}
     with one_thread():
         one = CoregistrationConfig(fit=config.fit, registration=config.registration)
-        results = space.run(RegisterWithModel(model, one), list(tasks.values()), config.workers, tell)
+        results = space.run(RegisterWithModel(model, one), list(tasks.values()), config.workers, report_progress)
     return ([results.values.get(task.name) for task in tasks.values()],
             {name: results.failures[task.name] for name, task in tasks.items() if task.name in results.failures})
 

@@ -140,7 +140,7 @@ def register_with_model(body: BodyModel | Subject, scan: Mesh | np.ndarray, land
     [BlendSCAPE]
     """
     config = config or CoregistrationConfig()
-    tell = progress or (lambda done, total: None)
+    report_progress = progress or (lambda done, total: None)
     marks: Landmarks = landmarks or (np.zeros(0, dtype=np.int64), np.zeros((0, 3)))
     vertices, points = check_pairs(body.template, *marks, "landmarks", 0)
     target = target_of(scan)
@@ -148,12 +148,12 @@ def register_with_model(body: BodyModel | Subject, scan: Mesh | np.ndarray, land
     fit, factor = prepare_scan_fit(person, scan, vertices, points, config.fit)
     # 1. pose, place and betas by matches alone
     x, tried = _pose_and_shape(fit, None if start is None else _unknowns_of_start(fit, start, factor))
-    tell(1, 2)
+    report_progress(1, 2)
     # 2. the template as the model predicts it is aligned with the scan
     aligned = register(_predict_own_mesh(person, fit, x), scan, None, config.registration)
     # 3. pose and betas from where there are data
     x = meet_vertices(fit, x, factor * aligned.mesh.vertices, aligned.confidence)
-    tell(2, 2)
+    report_progress(2, 2)
     predicted, mesh, seen = _predict_own_mesh(person, fit, x), aligned.mesh, aligned.seen
     pose, trans, betas = person.split(fit.body.in_metres(x)[0])
     off_model = np.linalg.norm(mesh.vertices - predicted.vertices, axis=1)[seen]

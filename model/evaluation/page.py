@@ -39,7 +39,7 @@ class Findings:
 
 
 def evaluation_page(name: str, model: BodyModel, found: Findings, metrics: Sequence[Metric],
-                    notes: Sequence[str] = (), tell: Tell | None = None) -> Page:
+                    notes: Sequence[str] = (), report_progress: Tell | None = None) -> Page:
     """Make the page, self-contained: notes, the table of metrics, pictures and curves."""
     page = Page(f"{name}, evaluated", f"A model of kind {model.kind} with {len(model.skeleton.parents)} parts and "
                 f"{model.n_betas} shape components, measured on bodies given to it.")
@@ -50,8 +50,8 @@ def evaluation_page(name: str, model: BodyModel, found: Findings, metrics: Seque
                                              (_space_section, model.n_betas)) if there]
     for i, section in enumerate(wanted):
         section(page, model, found)
-        if tell:
-            tell(i + 1, len(wanted))
+        if report_progress:
+            report_progress(i + 1, len(wanted))
     return page
 
 

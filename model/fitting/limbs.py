@@ -77,7 +77,7 @@ def find_misplaced_limbs(fit: ScanFit, x: np.ndarray, least: float = AMISS) -> l
     Misplaced limbs violate space, or could explain scan points that nothing explains.
     """
     wrong = np.zeros(len(fit.ids))
-    for weight, ids, found in fit.objections(fit.skin(x)):
+    for weight, ids, found in fit.free_space_violations(fit.skin(x)):
         wrong[ids] += weight * np.minimum(found.excess, CAP)**2 / len(ids)
     lost, strange = fit.thin.points[fit.find_unexplained(x, fit.thin)], fit.strange(x)
     misplacements = {tuple(limb): misplacement(fit, x, limb, wrong, lost) + float(strange[limb].sum())

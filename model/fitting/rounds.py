@@ -29,7 +29,7 @@ class Solved:
     energies: dict[str, float]
 
 
-def solve_jointly(fit: ScanFit, few: ScanFit, x: np.ndarray, tell: Callable[[int], None]) -> Solved:
+def solve_jointly(fit: ScanFit, few: ScanFit, x: np.ndarray, report_progress: Callable[[int], None]) -> Solved:
     """Fit all unknowns from x (P,), in rounds of matching with shrinking reach, with `few` vertices first.
 
     A model of many scans follows a scan closely, so distant matches are wrong. A model of few scans does not, and at a
@@ -40,7 +40,7 @@ def solve_jointly(fit: ScanFit, few: ScanFit, x: np.ndarray, tell: Callable[[int
     """
     wide_reach = 0.08  # metres: limit on the distance of matches, for models that follow a scan badly
     reaches = np.geomspace(REACH, wide_reach, fit.config.rounds)
-    rough = _in_rounds(few, x, reaches, tell, 0)
+    rough = _in_rounds(few, x, reaches, report_progress, 0)
     # at least two rounds with all vertices at the wide reach, then the narrow one
     wide = _in_rounds(fit, rough.x, reaches[-1:].repeat(2), lambda i: None)
     narrow = _in_rounds(fit, wide.x, np.geomspace(wide_reach, FINAL_REACH, NARROWING), lambda i: None)
@@ -48,7 +48,7 @@ def solve_jointly(fit: ScanFit, few: ScanFit, x: np.ndarray, tell: Callable[[int
     return replace(best, rounds=rough.rounds + wide.rounds + narrow.rounds)
 
 
-def _in_rounds(fit: ScanFit, x: np.ndarray, reaches: np.ndarray, tell: Callable[[int], None],
+def _in_rounds(fit: ScanFit, x: np.ndarray, reaches: np.ndarray, report_progress: Callable[[int], None],
                settling: int = SETTLING) -> Solved:
     """Fit from x (P,) with one largest match distance, metres, a round; the last is repeated until convergence."""
     shift, place, rounds = np.inf, fit.skin(x).places, len(reaches)
@@ -56,7 +56,7 @@ def _in_rounds(fit: ScanFit, x: np.ndarray, reaches: np.ndarray, tell: Callable[
         x, matched = fit.step(x, fit.thin, reach)
         before, place = place, fit.skin(x).places
         shift = float(np.sqrt(((place - before)**2).sum(axis=1).mean()))
-        tell(min(i + 1, rounds))
+        report_progress(min(i + 1, rounds))
         if i + 1 >= rounds and shift < SETTLED:
             break
     return Solved(x, bool(shift < 2 * SETTLED), i + 1, matched.energies(x))

@@ -220,7 +220,7 @@ class ScanFit:
         squared = np.where(found.valid, along**2 + np.maximum(beside - self.sample.gaps, 0)**2, cap**2)
         apart = (np.minimum(squared, cap**2) * ~(found.valid & self.sample.ignored[found.index])).mean()
         # violations of space, landmarks, the prior, and unknown joint rotations
-        for weight, ids, violation in self.objections(skin):
+        for weight, ids, violation in self.free_space_violations(skin):
             apart += weight * (np.minimum(violation.excess, cap)**2).sum() / len(ids)
         marked = ((skin.places[self.vertices] - self.points)**2).sum() / config.landmark_sd**2
         return float(EVIDENCE * apart / config.scan_sd**2 + marked) + self.unlikely(x) + float(self.strange(x).sum())
@@ -330,7 +330,7 @@ class ScanFit:
         """
         share = EVIDENCE / self.config.scan_sd**2
         ids, targets, normals, weights = [], [], [], []
-        for weight, mine, found in self.objections(skin):
+        for weight, mine, found in self.free_space_violations(skin):
             out = found.excess > 0
             ids.append(mine[out])
             targets.append(found.target[out])
@@ -338,7 +338,7 @@ class ScanFit:
             weights.append(weight * share / len(mine) * energy.geman_mcclure(found.excess[out], 0.1))
         return tuple(np.concatenate(part) for part in (ids, targets, normals, weights))
 
-    def objections(self, skin: Skin) -> list[tuple[float, np.ndarray, Violation]]:
+    def free_space_violations(self, skin: Skin) -> list[tuple[float, np.ndarray, Violation]]:
         """List the violations of space, each with its weight and its vertices."""
         config, places, normals = self.config, skin.places, skin.normals
         mine = self.sample.matched

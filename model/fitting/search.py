@@ -55,18 +55,18 @@ def lay_model(model: BodyModel, template: Mesh, progress: Callable[[int, int], N
     ModelMismatchError
         No body of the model fits the template.
     """
-    tell, own = progress or (lambda done, total: None), model.template
+    report_progress, own = progress or (lambda done, total: None), model.template
     if np.array_equal(own.faces, template.faces) and np.allclose(own.vertices, template.vertices, atol=1e-6):
-        tell(1, 1)                             # the model was learned with this template
+        report_progress(1, 1)                             # the model was learned with this template
         return template
     # largest shares of the template that is uncovered, and of the body that is stretched. A woman has 0.004 and 0.0002;
     # a crab has 0.005 and 0.088.
     other = 0.02, 0.05
     for body in find_bodies(model, template):
-        tell(1, 2)
+        report_progress(1, 2)
         laid = register(body, template, start=body.vertices)
         if laid.uncovered <= other[0] and share_stretched(body, laid.mesh) <= other[1]:
-            tell(2, 2)
+            report_progress(2, 2)
             return laid.mesh
     raise ModelMismatchError(f"the model does not come to lie on the template, {100 * laid.uncovered:.0f}% of which "
                              "lies off it: a model of something else?")

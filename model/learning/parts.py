@@ -65,12 +65,12 @@ def choose_skeleton(template: Mesh, poses: np.ndarray, progress: Progress | None
     ValueError
         As `find_skeleton`; a part that is too small for the coarse copies.
     """
-    tell = progress or (lambda done, total: None)
+    report_progress = progress or (lambda done, total: None)
     poses = np.asarray(poses, dtype=np.float64)
     settings = SkeletonConfig()
     whole = 1 + settings.restarts + TRIES
     shown = poses if known is None else np.concatenate([poses, known])
-    finder = SkeletonFinder(template, shown, settings, lambda done, total: tell(done, whole), step)
+    finder = SkeletonFinder(template, shown, settings, lambda done, total: report_progress(done, whole), step)
     coarse_vertices = 2500  # of the coarse bodies on which models are compared: a model in seconds
     vertices, coarse = coarse_copy(template, coarse_vertices)
 
@@ -87,7 +87,7 @@ def choose_skeleton(template: Mesh, poses: np.ndarray, progress: Progress | None
     for done in range(1, 1 + TRIES):
         wanted = len(best.parents) + MORE
         finer = tried(wanted)
-        tell(settings.restarts + done, whole)
+        report_progress(settings.restarts + done, whole)
         if finer is None or (is_person(best) and not is_person(finer[0])):
             break                       # the pose prior of people needs the names of parts, which would be lost
         errors[wanted] = finer[1]
@@ -95,7 +95,7 @@ def choose_skeleton(template: Mesh, poses: np.ndarray, progress: Progress | None
         if errors[wanted] > (1 - 0.03) * errors[len(best.parents)]:
             break
         best = finer[0]
-    tell(whole, whole)
+    report_progress(whole, whole)
     return ChosenSkeleton(best, errors)
 
 

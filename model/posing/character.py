@@ -145,14 +145,14 @@ def _register_character(template: Mesh, mesh: Mesh, vertices: np.ndarray, points
                         config: CharacterMeshConfig,
                         progress: Progress | None) -> Registration:
     """Register the template to the mesh, scaled by the landmarks, in two passes."""
-    tell = progress or (lambda done, total: None)
+    report_progress = progress or (lambda done, total: None)
     size = _spread(template.vertices[vertices]) / _spread(points)
     start = template.with_vertices(template.vertices / size)
     # two registrations, the second from the result of the first: one alone does not stretch so far
     registrations = 2
     for k in range(registrations):
         def told(done: int, total: int, before: int = k) -> None:
-            tell(before * total + done, registrations * total)
+            report_progress(before * total + done, registrations * total)
 
         fit = register(start, mesh, (vertices, points), config.register, told)
         start = fit.mesh

@@ -107,7 +107,7 @@ class Work:
     unit: Unit | None = None                                      # of scans and features, where files cannot tell
     command: str = field(default="", metadata={"digest": False})  # for the report of each scan of a folder
 
-    def __call__(self, inputs: ScanTask, room: TaskContext) -> list[Metric]:
+    def __call__(self, inputs: ScanTask, context: TaskContext) -> list[Metric]:
         """Fit the statue of some files into the folder of a room; the figures."""
         start = time.perf_counter()
         scan, texture, rows, doubts = read_scan(inputs, self.unit)
@@ -115,14 +115,14 @@ class Work:
         if inputs.landmarks is not None:
             joints, points = read_features(inputs.landmarks, self.control, scan, self.unit)
             rows += [Metric("joints given", len(joints)), Metric("surface points given", len(points))]
-        statue = fit_statue(scan, joints, points, self.control, self.config, room.tell, room.step)
+        statue = fit_statue(scan, joints, points, self.control, self.config, context.report_progress, context.step)
         if texture is not None or scan.colors is not None:
-            image = room.step("texture", (self, inputs), lambda: bake_texture(
+            image = context.step("texture", (self, inputs), lambda: bake_texture(
                 statue.control, statue.map, scan_look(texture or scan)))
             statue = replace(statue, texture=image)
-        metrics = write_statue(room.folder, inputs.scan.name, scan, statue, rows, doubts)
+        metrics = write_statue(context.folder, inputs.scan.name, scan, statue, rows, doubts)
         if self.command:
-            write_report(Outcome(room.folder, metrics, {"statue": self.config}, judgement=judgement_of(metrics)),
+            write_report(Outcome(context.folder, metrics, {"statue": self.config}, judgement=judgement_of(metrics)),
                          self.command, time.perf_counter() - start)
         return metrics
 

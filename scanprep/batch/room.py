@@ -44,12 +44,13 @@ class TaskContext:
     """What a task gets to work with.
 
     `folder` is for its files. `step` keeps intermediate results, which an interrupted task finds again.
-    `tell(done, total)` reports progress. With `force` no step of an earlier run counts as done.
+    `report_progress(done, total)` reports progress. With `force` no step of an earlier run counts as done.
     """
 
-    def __init__(self, folder: Path, steps: Path | None = None, tell: Progress | None = None, force: bool = False
+    def __init__(self, folder: Path, steps: Path | None = None, report_progress: Progress | None = None,
+                 force: bool = False
                  ) -> None:
-        self.folder, self._steps, self.tell = folder, steps, tell or (lambda done, total: None)
+        self.folder, self._steps, self.report_progress = folder, steps, report_progress or (lambda done, total: None)
         self._digests, self._force, self._made = Digests(), force, set[str]()
 
     def step(self, name: str, inputs: Any, make: Callable[[], T]) -> T:

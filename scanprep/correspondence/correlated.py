@@ -75,7 +75,7 @@ def find_correspondences(template: Mesh, scan: Mesh | np.ndarray, seeds: tuple[n
 
     [CC]
     """
-    config, tell = config or CorrelatedConfig(), progress or (lambda done, total: None)
+    config, report_progress = config or CorrelatedConfig(), progress or (lambda done, total: None)
     check_template(template)
     if seeds is None:
         ends = find_seeds(template, scan)
@@ -88,10 +88,10 @@ def find_correspondences(template: Mesh, scan: Mesh | np.ndarray, seeds: tuple[n
     known = Seeds(vertices, places, points, _surface(template).distances(vertices), sheet.distances(points))
     # features of both surfaces; then belief propagation, coarse to fine
     surfaces, images = surfaces_of(template, sheet, known, config), None
-    tell(2, total)
+    report_progress(2, total)
     for number, level in enumerate(config.levels):
         surfaces, images = propagate_beliefs(surfaces, images, level, config)
-        tell(4 + 2 * number, total)
+        report_progress(4 + 2 * number, total)
     assert images is not None, "levels: expected at least one"
     return result(surfaces, images, config)
 

@@ -158,7 +158,8 @@ class RegisterScan:
 
     def register(self, task: ScanTask, context: TaskContext) -> RegisteredScan:
         """Register the template to a scan."""
-        return register_scan(task, self.template, dict(self.landmarks), self.settings, self.parts, context.tell,
+        return register_scan(task, self.template, dict(self.landmarks), self.settings, self.parts,
+                             context.report_progress,
                              self.lead)
 
     def write(self, folder: Path, name: str, registered: RegisteredScan) -> None:

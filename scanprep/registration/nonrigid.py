@@ -202,16 +202,16 @@ def register(template: Mesh, scan: Mesh | np.ndarray, landmarks: tuple[np.ndarra
 
     [Hahnel], [Allen], [Amberg]
     """
-    config, tell = config or RegistrationConfig(), progress or (lambda done, total: None)
+    config, report_progress = config or RegistrationConfig(), progress or (lambda done, total: None)
     if config.method not in METHODS:
         raise ValueError(f"method: expected one of {', '.join(METHODS)}, got {config.method!r}")
     # check the inputs; describe every point by position, normal and path lengths to landmarks
     inputs = prepare_problem(template, scan, landmarks, correspondences)
     begin = initial_transform(inputs) if start is None else _check_start(template, start)
     # bring the template near the scan, from stiff to soft; then fit the surface down to the noise
-    fit = METHODS[config.method](inputs, begin, config, lambda done, total: tell(90 * done // total, 100))
+    fit = METHODS[config.method](inputs, begin, config, lambda done, total: report_progress(90 * done // total, 100))
     fit = snap_to_surface(inputs, fit, config)
-    tell(100, 100)
+    report_progress(100, 100)
     return measure_fit(inputs, fit, scan)
 
 

@@ -65,14 +65,14 @@ def stature(template: Mesh, parts: PersonParts, vertices: np.ndarray) -> float:
     return height * bones(vertices) / bones(template.vertices)
 
 
-def _find_parts(template: Mesh, tell: Callable[[int, int], None]) -> PersonParts | None:
+def _find_parts(template: Mesh, report_progress: Callable[[int, int], None]) -> PersonParts | None:
     """Find the parts of a template that is not in the cache."""
     person = average_person()
     if np.array_equal(template.faces, person.mesh.faces):
         # the template has the triangles of the synthetic people: no registration is needed
         part_of_face, vertices = person.part_of_face, template.vertices
     else:
-        fit = _person_on(template, None, RegistrationConfig(), tell)
+        fit = _person_on(template, None, RegistrationConfig(), report_progress)
         if fit is None:
             return None
         # each triangle takes the part of the nearest triangle of the registered average person
@@ -94,19 +94,20 @@ def has_limbs(template: Mesh) -> bool:
 
 
 def _person_on(template: Mesh, landmarks: tuple[np.ndarray, np.ndarray] | None, config: RegistrationConfig,
-               tell: Callable[[int, int], None]) -> Registration | None:
+               report_progress: Callable[[int, int], None]) -> Registration | None:
     """Register the average person to a template, by landmarks or by limb ends; None where it does not fit."""
     person = average_person().mesh
     matching = 30  # per cent of the progress bar; registration takes the rest
     if landmarks is not None:
-        fit = register(person, template, landmarks, config, tell)
+        fit = register(person, template, landmarks, config, report_progress)
     else:
         if not has_limbs(template):
             return None
         seeds = find_seeds(person, template)
         pairs = find_correspondences(person, template, (seeds.template_vertices, seeds.scan_points),
-                                     progress=lambda done, total: tell(round(matching * done / total), 100))
-        fit = register(person, template, None, config, correspondences=pairs, progress=lambda done, total: tell(
+                                     progress=lambda done, total: report_progress(round(matching * done / total), 100))
+        fit = register(person, template, None, config, correspondences=pairs, progress=lambda done,
+                       total: report_progress(
             round(matching + (100 - matching) * done / total), 100))
     # no person: more than 2% of the template uncovered, or more than 5% of the average person stretched to the double
     return None if fit.uncovered > 0.02 or share_stretched(person, fit.mesh) > 0.05 else fit

@@ -62,7 +62,7 @@ def repair_limbs(template: Mesh, scan: Mesh | np.ndarray, fit: Registration, par
     # the last stages match by position alone, so no path descriptors are computed
     inputs = replace(prepare_problem(template, scan), landmarks=landmarks, hints=correspondences)
     coarse = [stage for stage in stages if stage.nodes == stages[0].nodes]
-    graph, tell = build_graph(template, coarse[0].nodes), progress or (lambda done, total: None)
+    graph, report_progress = build_graph(template, coarse[0].nodes), progress or (lambda done, total: None)
     candidate_rolls = other_rolls(parts, parts.skeleton.fit_rotations(template, x), doubted, config.rolls)
     start, looks = motion_of(graph, x), list[tuple[float, float, GraphFit]]()
     # run each candidate through the coarse stages, three rounds each at most, and note severity and uncovered share
@@ -74,7 +74,7 @@ def repair_limbs(template: Mesh, scan: Mesh | np.ndarray, fit: Registration, par
         trial = fit_stages(inputs, begun, short)
         looks.append((severity(limb_doubts(template, parts, trial.x)),
                       share_uncovered(scan, template.with_vertices(trial.x), 0.01 * inputs.size), trial))
-        tell(number + 1, len(candidate_rolls) + 1)
+        report_progress(number + 1, len(candidate_rolls) + 1)
     # run the most plausible candidate to the end, if it promises a gain; keep it only if it is better
     best = min(looks, key=lambda look: look[:2], default=None)
     if best is not None and best[0] + LESS_DOUBTED < now:
@@ -82,7 +82,7 @@ def repair_limbs(template: Mesh, scan: Mesh | np.ndarray, fit: Registration, par
         trial_fit = measure_fit(inputs, end, scan)
         if better(template, parts, trial_fit, fit):
             fit = replace(trial_fit, rolled=True)
-    tell(len(candidate_rolls) + 1, len(candidate_rolls) + 1)
+    report_progress(len(candidate_rolls) + 1, len(candidate_rolls) + 1)
     return fit
 
 

@@ -58,15 +58,15 @@ class SkeletonFinder:
         tied = self.symmetry.holds if config.symmetric is None else config.symmetric
         if tied and not self.symmetry.two_sided:
             raise ValueError("symmetric: this template has no two sides")
-        tell, self.surface = _progress(progress, config.restarts), PosedSurface(template, poses)
+        report_progress, self.surface = _progress(progress, config.restarts), PosedSurface(template, poses)
         # a restart does not depend on the requested number of parts or on the other restarts: cached results stay valid
         kept = partial(step, inputs=(template, poses, replace(config, parts=None, restarts=1)))
         symmetry = self.symmetry if tied else None
-        runs = _restarts(self.surface, config, symmetry, tell, kept)                # [Articulated] E- and M-steps
+        runs = _restarts(self.surface, config, symmetry, report_progress, kept)           # [Articulated] E- and M-steps
         if tied and self.symmetry.holds and _is_held_back(_best(runs)):     # few poses: a limb bends on one side only
             both = np.concatenate([poses, mirror_poses(template, poses, self.symmetry)])
             self.surface = PosedSurface(template, both)
-            runs = _restarts(self.surface, config, symmetry, tell, kept, "mirrored")
+            runs = _restarts(self.surface, config, symmetry, report_progress, kept, "mirrored")
         self.first, self.runs = runs[0], sorted(runs, key=lambda run: run.score)
 
     def skeleton(self, run: Restart, parts: int | None) -> tuple[Skeleton, bool]:
@@ -92,13 +92,13 @@ def _progress(progress: Callable[[int, int], None] | None, restarts: int) -> Cal
     """Return a callback that counts restarts; there may be twice as many if limbs bend on one side only."""
     done, total = 0, restarts + 1
 
-    def tell() -> None:
+    def report_progress() -> None:
         nonlocal done
         done = min(done + 1, total - 1)
         if progress is not None:
             progress(done, total)
 
-    return tell
+    return report_progress
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,7 +113,8 @@ class Restart:
     search: PartSearch
 
 
-def _restarts(surface: PosedSurface, config: SkeletonConfig, symmetry: Symmetry | None, tell: Callable[..., None],
+def _restarts(surface: PosedSurface, config: SkeletonConfig, symmetry: Symmetry | None,
+              report_progress: Callable[..., None],
               kept: Callable[..., Tree], poses: str = "") -> list[Restart]:
     """Run all restarts in parallel; `poses` names the set of poses in the cache."""
     rng = np.random.default_rng(config.seed)
@@ -126,7 +127,7 @@ def _restarts(surface: PosedSurface, config: SkeletonConfig, symmetry: Symmetry 
             search.forget()
             runs.append(Restart(label, links, loops, search.energy(label) / surface.area, _score(search, label),
                                 search))
-            tell()
+            report_progress()
     return runs
 
 

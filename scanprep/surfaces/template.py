@@ -157,8 +157,8 @@ def views_without_cameras(views: Sequence[Mesh | PointCloud]) -> PointCloud:
 def _finish(mesh: Mesh, faces: int, config: TemplateConfig, progress: Callable[[int, int], None] | None, what: str,
             landmarks: np.ndarray | None = None) -> MadeTemplate:
     """Smooth, fill and decimate an open surface; vertices at landmarks (L, 3), such as fingertips, stay."""
-    tell, notes = progress or (lambda done, total: None), list[str]()
-    tell(1, 4)
+    report_progress, notes = progress or (lambda done, total: None), list[str]()
+    report_progress(1, 4)
     mesh = repair(mesh)
     # the same smoothing length as on merged views: on coarse scans as many rounds would round off fingers
     rounds = min(config.smoothing, round(config.smoothing * (config.merge.voxel / mesh.mean_edge)**2))
@@ -166,10 +166,10 @@ def _finish(mesh: Mesh, faces: int, config: TemplateConfig, progress: Callable[[
     holes = len(mesh.boundary_loops)
     if holes:
         notes.append(f"{number_of(holes, 'hole was', 'holes were')} filled")
-    tell(2, 4)
+    report_progress(2, 4)
     mesh = close(mesh, config.fill)
     mesh = smooth_taubin(close(drop_thin(mesh, config.thinnest), config.fill), rounds)
-    tell(3, 4)
+    report_progress(3, 4)
     surface = Surface(mesh)
     if mesh.volume < 0:
         mesh = Mesh(mesh.vertices, np.ascontiguousarray(mesh.faces[:, ::-1]), mesh.colors)
@@ -187,7 +187,7 @@ def _finish(mesh: Mesh, faces: int, config: TemplateConfig, progress: Callable[[
         small = close(small, config.fill)
     check_template(small, what)
     far = Surface(scanned).closest(small.corners.mean(axis=1)).distances > scanned.mean_edge
-    tell(4, 4)
+    report_progress(4, 4)
     # genus by the Euler characteristic; triangles farther from the scan than its mean edge are filled
     handles = 1 - (len(small.vertices) - len(small.edges) + len(small.faces)) // 2
     return MadeTemplate(small, tuple(notes), float(small.face_areas[far].sum() / small.face_areas.sum()), handles,

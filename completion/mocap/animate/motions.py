@@ -41,7 +41,7 @@ def motion_among(path: Path) -> bool:
 
 
 def bring(path: Path, model: BodyModel, name: str, subject: Subject | None, unit: str | None, rate: float | None,
-          room: TaskContext) -> tuple[list[Metric], Motion, Subject, Page]:
+          context: TaskContext) -> tuple[list[Metric], Motion, Subject, Page]:
     """Retarget a motion or keys to a body and write it into the folder of a task.
 
     Returned are the figures, the motion, the body, and the page, which is not written yet.
@@ -57,8 +57,8 @@ def bring(path: Path, model: BodyModel, name: str, subject: Subject | None, unit
         judgement = judge_fit(source.fit)
     motion = Motion.of(source)
     metrics = [judgement_row(judgement), Metric("model", name), *transfer_figures(source)]
-    write_motion_folder(room.folder, motion, body)
-    metrics += write_glb(room.folder / "animation.glb", motion, body)
+    write_motion_folder(context.folder, motion, body)
+    metrics += write_glb(context.folder / "animation.glb", motion, body)
     # the page, with the joint centres of the other skeleton if there is one
     page = Page(f"{path.name}, on the body", "The body in motion" + (
         ", with dots where the joint centres of the motion's own skeleton would be with bones as long as these."
@@ -67,7 +67,7 @@ def bring(path: Path, model: BodyModel, name: str, subject: Subject | None, unit
         page.bodies([moving_pane(motion, body)], "Press the triangle to play, drag the body to turn it.", 520)
     else:
         _joints(page, replace(motion, residuals=source.fit.distances, labels=source.fit.names,
-                              trusted=np.ones_like(source.fit.distances, dtype=bool)), body, source.fit, room.folder)
+                              trusted=np.ones_like(source.fit.distances, dtype=bool)), body, source.fit, context.folder)
     return metrics, motion, body, page.section("Figures").figures(metrics)
 
 

@@ -63,36 +63,36 @@ class AnimateTask:
     person: PersonConfig
     unlabelled: bool = False             # markers have no names
 
-    def __call__(self, path: Path, room: TaskContext) -> list[Metric]:
+    def __call__(self, path: Path, context: TaskContext) -> list[Metric]:
         """Follow the markers of a file, or retarget its motion, and write everything into the folder of a task.
 
         Returned are the figures, the judgement first.
         """
-        metrics, motion, body, page = bring(path, self.model, self.name, self.subject, self.unit, self.rate, room) \
-            if names_motion(path) else self._follow(path, room)
+        metrics, motion, body, page = bring(path, self.model, self.name, self.subject, self.unit, self.rate, context) \
+            if names_motion(path) else self._follow(path, context)
         if self.retarget_to is not None:
             other = retarget(motion, body, self.retarget_to)
-            other.save(room.folder / "onto.npz")
-            metrics += write_glb(room.folder / "onto.glb", other, self.retarget_to)
+            other.save(context.folder / "onto.npz")
+            metrics += write_glb(context.folder / "onto.glb", other, self.retarget_to)
             page.section("On another person", "The same rotations of the joints; the way over the ground is as much "
                          "longer as the legs are, and the feet are on the ground when those of the first are.")
             page.bodies([moving_pane(other, self.retarget_to)])
         if self.betas_to is not None:
             bodies = partial(morph_vertices, self.model, motion, betas_in_motion(self.betas_to, motion))
-            metrics += write_glb(room.folder / "morph.glb", motion, body, bodies)
+            metrics += write_glb(context.folder / "morph.glb", motion, body, bodies)
             page.section("With a body that changes", "Betas change straight from key to key, or are given for every "
                          "frame.")
             page.bodies([moving_pane(motion, body, bodies=bodies)])
-        page.write(room.folder / "report.html")
+        page.write(context.folder / "report.html")
         return metrics
 
-    def _follow(self, path: Path, room: TaskContext) -> tuple[list[Metric], Motion, Subject, Page]:
+    def _follow(self, path: Path, context: TaskContext) -> tuple[list[Metric], Motion, Subject, Page]:
         """Compute the motion of the markers of a file and write it."""
         # read the markers, and label them first if they have no names
         labelling = Judgement()
         if self.unlabelled:
             usual, _ = choose_layout(self.model, self.layout, ())
-            file = label_first(room, "", path, self.subject or self.model, usual, self.unit, self.rate)
+            file = label_first(context, "", path, self.subject or self.model, usual, self.unit, self.rate)
             sequence, labelling = file.markers, file.judgement
         else:
             sequence = read_markers(path, self.unit, self.who, self.rate)
@@ -102,16 +102,16 @@ class AnimateTask:
         # the person, found from the markers
         if body is None:
             usual = layout
-            sequence, fit, misplaced = self._person(sequence, layout, room)
+            sequence, fit, misplaced = self._person(sequence, layout, context)
             placed = fit.judgement(usual)
             body, layout = self.model.subject(fit.betas), fit.layout
             metrics += [Metric("subject", f"{len(fit.betas)} betas from {len(fit.frames)} frames"),
                         *misplaced.metrics(), *fit.metrics(usual)]
         # the key of the kept motion: of a found person its betas, which are quicker to digest than its body
         whose = self.subject if fit is None else (self.model, fit.betas)
-        motion = room.step("motion", (whose, sequence, layout, self.animate),
-                           lambda: animate(body, sequence, layout, self.animate, room.tell))
-        output = room.folder
+        motion = context.step("motion", (whose, sequence, layout, self.animate),
+                              lambda: animate(body, sequence, layout, self.animate, context.report_progress))
+        output = context.folder
         if fit is not None:
             storage.write_json(output / "subject.json", {"betas": fit.betas.tolist(),
                                                          "frames": fit.frames[:, 1].tolist()})
@@ -131,16 +131,16 @@ class AnimateTask:
             show_labels(page)
         return metrics, motion, body, page
 
-    def _person(self, sequence: MarkerSequence, layout: MarkerLayout, room: TaskContext
+    def _person(self, sequence: MarkerSequence, layout: MarkerLayout, context: TaskContext
                 ) -> tuple[MarkerSequence, PersonFit, MisplacedMarkers]:
         """Find the person; return the markers under corrected names, the fit, and misplaced markers."""
         def find(name: str, markers: MarkerSequence, usual: MarkerLayout) -> PersonFit:
-            return room.step(name, (self.model, markers, usual, self.person),
-                             lambda: find_person(self.model, markers, usual, self.person, room.tell))
+            return context.step(name, (self.model, markers, usual, self.person),
+                                lambda: find_person(self.model, markers, usual, self.person, context.report_progress))
 
         fit = find("subject", sequence, layout)
-        misplaced = room.step("misplaced", (self.model, sequence, layout, fit, self.person),
-                              lambda: find_misplaced_markers(self.model, [sequence], layout, fit, self.person))
+        misplaced = context.step("misplaced", (self.model, sequence, layout, fit, self.person),
+                                 lambda: find_misplaced_markers(self.model, [sequence], layout, fit, self.person))
         if not misplaced.changes:
             return sequence, fit, misplaced
         sequence = misplaced.restore_names(sequence, layout)

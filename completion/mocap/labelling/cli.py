@@ -79,9 +79,10 @@ def label_recordings(markers: MarkersArg, output: Output, model: ModelOrNone = N
         return _label_folder(markers, work, space, workers, settings)
     if not output.suffix:
         return do_one("labelling", space, work, Task("labels", markers), settings, f"open {output / 'report.html'}")
-    with bar("labelling") as tell:
+    with bar("labelling") as report_progress:
         table, page = output.with_suffix(".labels.csv"), output.with_suffix(".report.html")
-        metrics = work.write(markers, TaskContext(output.parent, tell=tell), output.name, table.name, page.name)
+        metrics = work.write(markers, TaskContext(output.parent, report_progress=report_progress), output.name,
+                             table.name, page.name)
     return Outcome(output, metrics, settings, judgement=judgement_of(metrics), following=f"open {page}")
 
 

@@ -92,7 +92,7 @@ def key_frames(points: np.ndarray, tracks: np.ndarray, known: np.ndarray, rate: 
 
 
 def follow_keys(searches: Sequence[BodySearch], keys: Sequence[KeyFrame], begin: int, placements: Sequence[Placement],
-                tell: Callable[[int], None]) -> list[Solutions | None]:
+                report_progress: Callable[[int], None]) -> list[Solutions | None]:
     """Solve the people in every key frame, forwards and backwards from the frame `begin` in which they were found.
 
     Tracks that continue keep their labels; other points are matched with the remaining markers of all people. Limbs,
@@ -109,7 +109,7 @@ def follow_keys(searches: Sequence[BodySearch], keys: Sequence[KeyFrame], begin:
         wait, quiet, usual = np.full(N, WAIT), np.zeros(N), np.full(N, np.inf)
         for i in way:
             done += 1
-            tell(done)
+            report_progress(done)
             quiet -= EVERY
             if len(keys[i].points) < 3:
                 held = nothing

@@ -178,7 +178,7 @@ def label_people(people: Sequence[tuple[BodyModel | Subject, MarkerLayout]], poi
 
     [SCAPE] §8
     """
-    tell = progress or (lambda done, total: None)
+    report_progress = progress or (lambda done, total: None)
     at, rate, T = points.positions, points.rate, len(points.positions)
     known = _check_known(known, points, sum(len(layout.labels) for _, layout in people))
     tracks = link_points(at, rate)
@@ -186,11 +186,11 @@ def label_people(people: Sequence[tuple[BodyModel | Subject, MarkerLayout]], poi
     # find the bodies, mean people or known ones, in one frame, follow them through key frames, and let these vote
     bodies = [_Person.start(model, layout) for model, layout in people]
     searches = [BodySearch(body.marked, body.subject) for body in bodies]
-    first, placements = find_start(searches, at, lambda done: tell(done, 4 * T))
+    first, placements = find_start(searches, at, lambda done: report_progress(done, 4 * T))
     times, keys = key_frames(at, tracks, known, rate, first)
     begin = int(np.searchsorted(times, first))
     found = follow_keys(searches, keys, begin, placements,
-                        lambda done: tell(T * done // len(keys), 4 * T))
+                        lambda done: report_progress(T * done // len(keys), 4 * T))
     columns = elect(count_votes(keys, found, tracks.max() + 1), tracks)
     columns, found = _in_order(bodies, columns, keys, found)
 
@@ -222,7 +222,7 @@ def label_people(people: Sequence[tuple[BodyModel | Subject, MarkerLayout]], poi
         offsets = offsets + find_displaced(at, columns, places, turns, part)
         places += np.einsum("tlij,lj->tli", turns, offsets)
         columns, sure = assign_by_places(at, tracks, known, places, rate, np.clip(deviations, sd, DEVIATIONS[0]))
-        tell((i + 2) * T, (len(DEVIATIONS) + 1) * T)
+        report_progress((i + 2) * T, (len(DEVIATIONS) + 1) * T)
 
     # what is left has no label
     unlabelled = points.seen.copy()
@@ -309,7 +309,7 @@ def _in_order(bodies: Sequence[_Person], columns: np.ndarray, keys: Sequence[Key
                            in zip(_of_each(bodies, columns), orders, strict=True)], axis=1), again
 
 
-def find_start(searches: Sequence[BodySearch], points: np.ndarray, tell: Callable[[int], None]
+def find_start(searches: Sequence[BodySearch], points: np.ndarray, report_progress: Callable[[int], None]
                ) -> tuple[int, list[Placement]]:
     """Find the frame, among a few full ones, in which the bodies fit best, and their placements there."""
     seen = np.isfinite(points[..., 0])
@@ -324,7 +324,7 @@ def find_start(searches: Sequence[BodySearch], points: np.ndarray, tell: Callabl
     for axes, count in ((UPS, len(frames)), (OTHERS, 2)):
         for i, (t, group) in enumerate(zip(frames[:count], groups[:count], strict=True)):
             tried.append((int(t), [search.find(some, axes) for search, some in zip(searches, group, strict=True)]))
-            tell(i + 1)
+            report_progress(i + 1)
         best = min(tried, key=lambda one: max(placement.misfit for placement in one[1]))
         worst = max(placement.misfit for placement in best[1])
         if worst < FOUND:

@@ -28,14 +28,15 @@ class LabelledFile:
     judgement: Judgement
 
 
-def label_first(room: TaskContext, name: str, path: Path, model: BodyModel | Subject, layout: MarkerLayout,
+def label_first(context: TaskContext, name: str, path: Path, model: BodyModel | Subject, layout: MarkerLayout,
                 unit: str | None, rate: float | None) -> LabelledFile:
     """Label a recording into NAME/labelled.c3d in the folder of a task, with labels.csv and labels.html.
 
     This is a kept step, which is not repeated for the same input.
     """
     def make(folder: Path) -> str:
-        found = label_recording(path, read_marker_points(path, unit, rate), model, layout, progress=room.tell)
+        found = label_recording(path, read_marker_points(path, unit, rate), model, layout,
+                                progress=context.report_progress)
         place = folder / name
         place.mkdir(parents=True, exist_ok=True)
         found.write(place / LABELLED)
@@ -44,10 +45,10 @@ def label_first(room: TaskContext, name: str, path: Path, model: BodyModel | Sub
         label_page(found, found.metrics(), TABLE, again).write(place / PAGE)
         return str(found.judgement)
 
-    told = Judgement.read(room.files(f"labels {name}", (path, model, layout, unit, rate), make))
+    told = Judgement.read(context.files(f"labels {name}", (path, model, layout, unit, rate), make))
     if told.problems:
         raise ValueError(f"{path}: no labels that could be used: {told.why}; `scape label` shows them")
-    labelled = room.folder / name / LABELLED
+    labelled = context.folder / name / LABELLED
     return LabelledFile(labelled, read_labelled(labelled, path, unit, rate), _own_unit(path, unit), told)
 
 

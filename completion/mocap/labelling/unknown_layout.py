@@ -124,18 +124,18 @@ def find_layout(model: BodyModel, points: MarkerSequence, progress: Progress | N
     """
     if not model.n_betas:
         raise ValueError("model: expected one with betas, this one knows its template's body only")
-    tell = progress or (lambda done, total: None)
+    report_progress = progress or (lambda done, total: None)
     tracks = long_tracks(points)
     total = STARTS + TRIED + ROUNDS
 
     # candidate bodies: the skin passes below all points of a frame
-    starts = _search_skin(model, tracks, lambda done: tell(done, total))
+    starts = _search_skin(model, tracks, lambda done: report_progress(done, total))
     # the candidate on which the tracks keep their places in other frames
     tried = list[tuple[float, PersonFit]]()
     for i, (t, placement) in enumerate(starts):
         fit = find_person(model, tracks, _layout_below(model, tracks, t, placement))
         tried.append((_cost(fit), fit))
-        tell(STARTS + i + 1, total)
+        report_progress(STARTS + i + 1, total)
     tried.sort(key=lambda one: one[0])
     best, fit = tried[0]
 
@@ -145,7 +145,7 @@ def find_layout(model: BodyModel, points: MarkerSequence, progress: Progress | N
     fit = find_person(model, tracks, _best_places(model, fit, tracks))
     for i in range(ROUNDS):
         fit = find_person(model, tracks, replace(fit.layout, loose=()), CLOSER)
-        tell(STARTS + TRIED + i + 1, total)
+        report_progress(STARTS + TRIED + i + 1, total)
     # if a known marker set explains the markers, move them to its places, as far as the tracks allow
     named, free = dict[str, str](), fit
     for _ in range(NAMED):
@@ -219,7 +219,7 @@ def long_tracks(points: MarkerSequence) -> MarkerSequence:
     return points.select([label for label, is_long in zip(points.labels, long, strict=True) if is_long])
 
 
-def _search_skin(model: BodyModel, tracks: MarkerSequence, tell: Callable[[int], None]
+def _search_skin(model: BodyModel, tracks: MarkerSequence, report_progress: Callable[[int], None]
                  ) -> list[tuple[int, Placement]]:
     """Search bodies whose skin passes below the points of some frames; return frames and bodies, the best first."""
     # 250 points of the skin, 9 cm apart, serve as markers for the search
@@ -243,7 +243,7 @@ def _search_skin(model: BodyModel, tracks: MarkerSequence, tell: Callable[[int],
             # 25 mm mean distance: good enough, no other axis is tried
             if cost < 0.025:
                 break
-        tell(i + 1)
+        report_progress(i + 1)
     found.sort(key=lambda one: one[0])
     return [(t, placement) for _, t, placement in found[:TRIED]]
 

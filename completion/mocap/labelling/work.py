@@ -33,20 +33,20 @@ class LabelWork:
     unit: str | None
     rate: float | None
 
-    def __call__(self, path: Path, room: TaskContext) -> list[Metric]:
+    def __call__(self, path: Path, context: TaskContext) -> list[Metric]:
         """Label a recording into the folder of a task; return the figures, the judgement first."""
-        return self.write(path, room, LABELLED, TABLE, "report.html")
+        return self.write(path, context, LABELLED, TABLE, "report.html")
 
-    def write(self, path: Path, room: TaskContext, recording: str, table: str, page: str) -> list[Metric]:
+    def write(self, path: Path, context: TaskContext, recording: str, table: str, page: str) -> list[Metric]:
         """Label a recording, with given names of the three files."""
         points = read_marker_points(path, self.unit, self.rate)
         layout, name = self._layout(points.labels)
         found = label_recording(path, points, self.subject or self.model, layout, self.people, self.labels,
-                                self.relabel, room.tell)
+                                self.relabel, context.report_progress)
         metrics = [*found.metrics(), Metric("model", self.name), Metric("layout", name)]
-        found.write(room.folder / recording)
-        found.write_table(room.folder / table)
-        label_page(found, metrics, table, f"run the same command with `--labels {table}`").write(room.folder / page)
+        found.write(context.folder / recording)
+        found.write_table(context.folder / table)
+        label_page(found, metrics, table, f"run the same command with `--labels {table}`").write(context.folder / page)
         return metrics
 
     def _layout(self, labels: tuple[str, ...]) -> tuple[MarkerLayout, str]:

@@ -151,8 +151,8 @@ def design_markers(model: BodyModel, bodies: np.ndarray, candidates: MarkerLayou
         raise ValueError("people: expected whose body each is, for betas that are common to a person's bodies")
     # fit and linearise, and split the people into halves
     total = 2 * len(bodies) + 2 * len(candidates.labels)
-    tell = progress or (lambda done, total: None)
-    fits = fit_bodies(model, bodies, candidates, config, lambda done, _: tell(done, total))
+    report_progress = progress or (lambda done, total: None)
+    fits = fit_bodies(model, bodies, candidates, config, lambda done, _: report_progress(done, total))
     linear, halves = fits.linear, np.arange(len(bodies)) < (len(bodies) + 1) // 2
     if people is not None:
         names = np.unique(people)
@@ -161,7 +161,8 @@ def design_markers(model: BodyModel, bodies: np.ndarray, candidates: MarkerLayou
         assert people is not None, "checked above"
         linear = share_betas(fits.linear, fits.x, np.asarray(people), fits.markers.n_betas)
         halves = np.arange(len(linear.rest)) < (len(linear.rest) + 1) // 2
-    choice = choose(linear, groups, kept, config, lambda done: tell(min(2 * len(bodies) + done, total), total))
+    choice = choose(linear, groups, kept, config,
+                    lambda done: report_progress(min(2 * len(bodies) + done, total), total))
 
     # sets chosen on one half of the bodies, measured on the other
     other: list[np.ndarray] = []
@@ -169,7 +170,7 @@ def design_markers(model: BodyModel, bodies: np.ndarray, candidates: MarkerLayou
         rest = linear.of(~mine)
         other.append(rest.surface_error(rest.steps(_members(groups,
                                                             choose(linear.of(mine), groups, kept, config).groups))))
-    tell(total, total)
+    report_progress(total, total)
 
     # errors of the set, and of some sets of the curve, without linearisation
     def refitted(chosen: list[int]) -> float:
@@ -194,15 +195,15 @@ def design_markers(model: BodyModel, bodies: np.ndarray, candidates: MarkerLayou
 
 
 def choose(linear: LinearBodies, groups: Groups, kept: np.ndarray, config: DesignConfig,
-           tell: Callable[[int], None] | None = None) -> Choice:
+           report_progress: Callable[[int], None] | None = None) -> Choice:
     """Search the set of `config.count` markers that contains groups `kept` (n,); return it with the curves."""
     every, free, step = np.arange(len(groups)), ~kept, [0]
     stops = {config.count, *config.through}
 
     def told(_: int) -> None:
         step[0] += 1
-        if tell is not None:
-            tell(step[0])
+        if report_progress is not None:
+            report_progress(step[0])
 
     # from all candidates downwards, and from the kept ones upwards
     paths = {"removed": improve_set(MarkerSets(linear, groups, every), REMOVE, free, FEWEST, stops, told),

@@ -133,7 +133,7 @@ def prior_around(model: BodyModel, x: np.ndarray, shape_weight: float = 1.0) -> 
 
 
 def fit_points(points: BodyPoints, targets: np.ndarray, weights: np.ndarray, prior: Prior, start: np.ndarray,
-               iterations: int, tell: Callable[[int], None] | None = None) -> np.ndarray:
+               iterations: int, report_progress: Callable[[int], None] | None = None) -> np.ndarray:
     """Fit unknowns (Z, P) to targets (Z, L, 3), metres, with weights (L,). [MoSh] Eq. 26"""
     root, solution = np.sqrt(weights)[:, None], np.empty_like(start)
     size = min(24, points.batch)  # bodies that are fitted at once
@@ -151,8 +151,8 @@ def fit_points(points: BodyPoints, targets: np.ndarray, weights: np.ndarray, pri
                          transposed @ J + prior_of_batch.precision)
 
         solution[some] = levenberg_marquardt(system, start[some], iterations, 1e-4, angles=points.n_angles).x
-        if tell is not None:
-            tell(min(begin + size, len(start)))
+        if report_progress is not None:
+            report_progress(min(begin + size, len(start)))
     return solution
 
 

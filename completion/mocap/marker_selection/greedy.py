@@ -142,7 +142,7 @@ class MarkerSets:
 
 
 def improve_set(sets: MarkerSets, sign: int, movable: np.ndarray, until: int, through: Collection[int] = (),
-                tell: Callable[[int], None] | None = None) -> Path:
+                report_progress: Callable[[int], None] | None = None) -> Path:
     """Add or remove the best group, by its effect per marker, again and again.
 
     Only groups of `movable` (n,) change, down or up to `until` markers. Counts in `through` are hit exactly where
@@ -167,8 +167,8 @@ def improve_set(sets: MarkerSets, sign: int, movable: np.ndarray, until: int, th
             sets.renew()
         counts.append(sets.count)
         rmse.append(sets.rmse)
-        if tell is not None:
-            tell(sets.count)
+        if report_progress is not None:
+            report_progress(sets.count)
 
 
 def exchange(sets: MarkerSets, movable: np.ndarray, rounds: int) -> int:

@@ -86,13 +86,14 @@ def fit_bodies(model: BodyModel, bodies: np.ndarray, candidates: MarkerLayout, c
     if not candidates.labels or most >= N:
         raise ValueError(f"candidates: expected markers on vertices 0..{N - 1}, got {len(candidates.labels)} markers "
                          f"up to vertex {most}")
-    tell, template, sd = progress or (lambda done, total: None), model.template.vertices, config.marker_sd
+    report_progress, template, sd = progress or (lambda done, total: None), model.template.vertices, config.marker_sd
     # fit to the whole surface, represented by 400 spread vertices, each weighted by its share
     sample = spread_vertices(template, 400)
     weights = share_of_vertices(template, sample) * len(sample) / (len(template) * sd**2)
     start = rough_poses(model, bodies, n_betas)
     x = fit_points(BodyPoints(model.points(sample, None, n_betas)), bodies[:, sample], weights,
-                   prior_around(model, start), start, FIT_ITERATIONS, lambda done: tell(done, 2 * len(bodies)))
+                   prior_around(model, start), start, FIT_ITERATIONS,
+                   lambda done: report_progress(done, 2 * len(bodies)))
     ids, shares = candidates.skin
     markers, prior = BodyPoints(model.points(ids, shares, n_betas)), prior_around(model, x)
     places = np.einsum("lk,zlkd->zld", shares, bodies[:, ids])
@@ -114,7 +115,7 @@ def fit_bodies(model: BodyModel, bodies: np.ndarray, candidates: MarkerLayout, c
         e = (root * (bodies[some][:, spread] - at.positions)).reshape(len(J), -1, 1)
         transposed = np.swapaxes(J, -1, -2)
         gram[some], pull[some], rest[some] = transposed @ J, (transposed @ e)[..., 0], (e**2).sum(axis=(1, 2))
-        tell(Z + min(begin + size, Z), 2 * Z)
+        report_progress(Z + min(begin + size, Z), 2 * Z)
     linear = LinearBodies(rows, gaps, gram, pull, rest, prior.precision, (prior.mean - x) @ prior.precision)
     return WholeFits(x, markers, places, prior, linear)
 
@@ -186,9 +187,9 @@ def in_poses(model: BodyModel, bodies: np.ndarray, poses: np.ndarray,
     """Put registered bodies (Z, N, 3), metres, with their own shape into poses (F, J, 3): (Z, F, N, 3) float32."""
     bodies = check_marker_bodies(model, bodies)
     poses, _ = check_pose(model.skeleton, poses, None)
-    fitter, tell = ShapeFitter(model, FitConfig(polish=0)), progress or (lambda done, total: None)
+    fitter, report_progress = ShapeFitter(model, FitConfig(polish=0)), progress or (lambda done, total: None)
     out = np.empty((len(bodies), len(poses), *bodies.shape[1:]), dtype=np.float32)
     for i, body in enumerate(np.asarray(bodies, dtype=np.float64)):
         out[i] = own_body(model, body, fitter.fit(body)).subject.vertices(poses)
-        tell(i + 1, len(bodies))
+        report_progress(i + 1, len(bodies))
     return out

@@ -99,14 +99,14 @@ def transfer_layout(layout: MarkerLayout, source: Mesh, target: Mesh, landmarks:
     if np.array_equal(source.faces, target.faces):
         L = len(layout.labels)
         return TransferredLayout(layout, np.zeros(L), np.ones(L), 0.0, np.nan, 0.0, target)
-    config, tell = config or RegistrationConfig(), progress or (lambda done, total: None)
+    config, report_progress = config or RegistrationConfig(), progress or (lambda done, total: None)
     if landmarks is not None or not search:
-        fit = register(source, target, landmarks, config, tell)
+        fit = register(source, target, landmarks, config, report_progress)
     else:
         # by correspondences; where much of the target stays uncovered, also from the present poses
-        fit = register(source, target, None, config, tell, find_correspondences(source, target))
+        fit = register(source, target, None, config, report_progress, find_correspondences(source, target))
         if fit.uncovered > UNCERTAIN:
-            fit = min(fit, register(source, target, None, config, tell), key=lambda one: one.uncovered)
+            fit = min(fit, register(source, target, None, config, report_progress), key=lambda one: one.uncovered)
     if fit.uncovered > 0.3:  # so much of the target is uncovered only if the registration failed
         raise ValueError(f"target: the source could not be brought onto it, {fit.uncovered:.0%} of it stays uncovered; "
                          "give landmarks, three at least, spread over the body")

@@ -85,7 +85,7 @@ def mosh_markers(markers: MarkersArg, output: Output, model: Models = (), layout
         return carry_out(call, space, workers, f"scape mosh {' '.join(sys.argv[2:])}", people, inside)
 
 
-def carry_out(call: MoshCall, space: Workspace, workers: Workers, command: str, *tell: Progress) -> Outcome:
+def carry_out(call: MoshCall, space: Workspace, workers: Workers, command: str, *report_progress: Progress) -> Outcome:
     """Run what has changed of a call in an open output; `tell` reports progress over people, and within one."""
     actors, loaded = call.actors(space.folder), call.models()
     work = MoshTask(loaded.neutral, loaded.name, loaded.sexes, loaded.character,
@@ -107,7 +107,7 @@ def carry_out(call: MoshCall, space: Workspace, workers: Workers, command: str, 
     if len(actors) > 20:
         say(f"and {len(actors) - 20} more people")
     # the work, then table, page and judgement
-    done = space.run(work, [Task(actor.name, actor, actor.name) for actor in actors], workers, *tell)
+    done = space.run(work, [Task(actor.name, actor, actor.name) for actor in actors], workers, *report_progress)
     results = Results({name: rows for name, (rows, _) in done.values.items()},
                       {name: line if line.startswith(f"{name}: ") else f"{name}: {line}"
                        for name, line in done.failures.items()}, done.fresh)

@@ -193,8 +193,8 @@ class MoshApp(ResultsApp):
         before = {one.name: self.result.figures(one.name) for one in self.result.people}
 
         mended = "scape mosh, mended in the browser"
-        def do(space: Workspace, tell: Progress) -> tuple[Outcome, str]:
-            outcome = carry_out(call, space, Workers(workers=1), mended, lambda done, total: None, tell)
+        def do(space: Workspace, report_progress: Progress) -> tuple[Outcome, str]:
+            outcome = carry_out(call, space, Workers(workers=1), mended, lambda done, total: None, report_progress)
             self.before = before
             failed = f"; failed: {'; '.join(outcome.failures)}" if outcome.failures else ""
             return outcome, f"run again with {Path(str(call.layout)).name}{failed}"

@@ -297,13 +297,13 @@ class _Stages:
         """Return the result of `make`, or that of an earlier run; with `bar` it reports progress."""
         before, self.done = self.done, self.done + STEPS * bar
 
-        def tell(done: int, total: int) -> None:
+        def report_progress(done: int, total: int) -> None:
             if self.progress:
                 self.progress(before + round(STEPS * done / max(total, 1)), self.total)
 
         def timed() -> tuple[T, np.ndarray]:
             start = clocks()
-            return make(tell if bar else None), clocks() - start
+            return make(report_progress if bar else None), clocks() - start
 
         value, seconds = self.step(name, inputs, timed)
         self.seconds[stage] = self.seconds.get(stage, 0) + seconds
@@ -321,7 +321,7 @@ class _Stages:
         step = substeps(step, again) if again else step
         return _Person(self.model, self.run(
             "person", f"{again} person".strip(), (self.model, used, layout, config),
-            lambda tell: find_person(self.model, used, layout, config, tell, step), not again))
+            lambda report_progress: find_person(self.model, used, layout, config, report_progress, step), not again))
 
     def find_misplaced_markers(self, trials: Sequence[_Trial], layout: MarkerLayout, person: _Person
                                ) -> MisplacedMarkers:
@@ -335,7 +335,8 @@ class _Stages:
         """Solve the motion of a person of fixed shape, from that of an earlier fit of the person if there is one."""
         fit, poses, markers, near = person.fit, self.config.poses, trial.markers, trial.motion
         trial.motion = self.run("poses", name, (self.model, fit.betas, fit.layout, markers, poses, near),
-                                lambda tell: animate(person.subject, markers, fit.layout, poses, tell, near),
+                                lambda report_progress: animate(person.subject, markers, fit.layout, poses,
+                                                                report_progress, near),
                                 near is None)
         trial.followed = markers
 
@@ -349,7 +350,8 @@ class _Stages:
         bad = self.config.artefacts
         trial.artefacts = self.run(
             "artefacts", name, (self.model, fit.betas, fit.layout, markers, motion, bad, known),
-            lambda tell: find_artefacts(person.subject, markers, fit.layout, bad, motion, tell, known), known is None)
+            lambda report_progress: find_artefacts(person.subject, markers, fit.layout, bad, motion, report_progress,
+                                                   known), known is None)
         trial.markers = trial.artefacts.repaired
 
     def find_soft_tissue(self, trial: _Trial, person: _Person) -> None:
@@ -359,7 +361,8 @@ class _Stages:
         assert motion is not None, "followed"
         trial.soft = self.run(
             "soft tissue", f"soft tissue {trial.number}", (model, layout, markers, motion, soft, ground, floor),
-            lambda tell: follow_soft_tissue(model, motion, markers, layout, soft, tell, ground, floor), True)
+            lambda report_progress: follow_soft_tissue(model, motion, markers, layout, soft, report_progress, ground,
+                                                       floor), True)
 
 
 @dataclass(frozen=True, eq=False)

@@ -65,13 +65,13 @@ class MoshTask:
     config: MoshConfig
     command: str = field(metadata={"digest": False})
 
-    def __call__(self, actor: Actor, room: TaskContext) -> tuple[list[Metric], list[str]]:
+    def __call__(self, actor: Actor, context: TaskContext) -> tuple[list[Metric], list[str]]:
         """Process one person into the folder of a task; return the figures, judgement first, and failures.
 
         A recording that cannot be read is left out and reported; ValueError where none can be read.
         """
-        start, folder = clocks(), room.folder
-        outcome, failures = _solve(self, actor, room)
+        start, folder = clocks(), context.folder
+        outcome, failures = _solve(self, actor, context)
         solved = clocks() - start
         settings = {"mosh": self.config, "model": self.name, "layout": outcome.layout_name, "held out": self.hold_out}
         # the person: betas and how they were found, where the markers sat
@@ -89,10 +89,10 @@ class MoshTask:
         figures: dict[str, list[Metric]] = {}
         pages, total = np.zeros(2), len(outcome.takes) + 1
         for i, take in enumerate(outcome.takes):
-            room.tell(HALF + HALF * i // total, 2 * HALF)
-            figures[take.name], seconds = _write(self, outcome, take, room, settings)
+            context.report_progress(HALF + HALF * i // total, 2 * HALF)
+            figures[take.name], seconds = _write(self, outcome, take, context, settings)
             pages += seconds
-        room.tell(HALF + HALF * (total - 1) // total, 2 * HALF)
+        context.report_progress(HALF + HALF * (total - 1) // total, 2 * HALF)
         # judgement, figures and page of the person
         pages -= clocks()
         judgement = outcome.judgement(outcome.takes)
@@ -111,7 +111,7 @@ class MoshTask:
               ((1, "processor time"), (0, "time by the clock")) for stage, seconds in stages.items()),
             Metric("speed", count / max(float(whole[1]), 1e-9), "frames/s")])
         write_report(Outcome(folder, metrics, settings, failures, judgement=judgement), self.command, float(whole[0]))
-        room.tell(2 * HALF, 2 * HALF)
+        context.report_progress(2 * HALF, 2 * HALF)
         return metrics, failures
 
 
@@ -150,7 +150,7 @@ class _Found:
         return judge_motions(self.person, own, motions, body)
 
 
-def _solve(work: MoshTask, actor: Actor, room: TaskContext) -> tuple[_Found, list[str]]:
+def _solve(work: MoshTask, actor: Actor, context: TaskContext) -> tuple[_Found, list[str]]:
     """Read the recordings of a person and run `mosh`; return the results and what could not be read."""
     # recordings, labelled first where markers have no names
     recordings, sequences, failures = list[Recording](), list[MarkerSequence](), list[str]()
@@ -159,7 +159,7 @@ def _solve(work: MoshTask, actor: Actor, room: TaskContext) -> tuple[_Found, lis
         try:
             if work.unlabelled:
                 assert work.layout is not None, "the command asks for one"
-                file = label_first(room, recording.name, recording.path, work.model, work.layout[0], work.unit,
+                file = label_first(context, recording.name, recording.path, work.model, work.layout[0], work.unit,
                                    work.rate)
                 labelling.append(Judgement.of(
                     check=[f"labels of {recording.name}: {why}" for why in file.judgement.reasons]))
@@ -185,13 +185,14 @@ def _solve(work: MoshTask, actor: Actor, room: TaskContext) -> tuple[_Found, lis
     model, guess = work.model, None
 
     def progress(done: int, total: int) -> None:
-        room.tell(HALF * done // total, 2 * HALF)
+        context.report_progress(HALF * done // total, 2 * HALF)
 
     if work.sexes:
-        by_sex = mosh_by_sex({"neutral": work.model, **work.sexes}, sequences, layout, work.config, progress, room.step)
+        by_sex = mosh_by_sex({"neutral": work.model, **work.sexes}, sequences, layout, work.config, progress,
+                             context.step)
         model, guess, result = by_sex.model, by_sex.guess, by_sex.result
     else:
-        result = mosh(model, sequences, layout, work.config, progress, room.step)
+        result = mosh(model, sequences, layout, work.config, progress, context.step)
     # a take for each sequence, with distances from held-out markers
     subject = model.subject(result.betas)
     light, takes = LightMesh.of(model.template), []
@@ -203,7 +204,7 @@ def _solve(work: MoshTask, actor: Actor, room: TaskContext) -> tuple[_Found, lis
     return _Found(model, guess, result, takes, usual, layout_name, Judgement().merge(*labelling)), failures
 
 
-def _write(work: MoshTask, found: _Found, take: Take, room: TaskContext, settings: Mapping[str, Any]
+def _write(work: MoshTask, found: _Found, take: Take, context: TaskContext, settings: Mapping[str, Any]
            ) -> tuple[list[Metric], np.ndarray]:
     """Write a sequence into its folder, in steps that are kept; return figures and times (2,) of the page, seconds."""
     metrics, factor = [Metric("layout", found.layout_name), *_figures([take])], work.config.exaggeration
@@ -229,16 +230,16 @@ def _write(work: MoshTask, found: _Found, take: Take, room: TaskContext, setting
         write_report(outcome, work.command, time.perf_counter() - start)
 
     determined = found.covered.told
-    metrics += room.files(f"{take.name} files",
-                          (solved, determined, take.source.path, take.source.who, take.unit, factor),
-                          lambda folder: write_take(place(folder), take, determined, factor))
+    metrics += context.files(f"{take.name} files",
+                             (solved, determined, take.source.path, take.source.who, take.unit, factor),
+                             lambda folder: write_take(place(folder), take, determined, factor))
     shown: list[Any] = []
     if (body := work.character) is not None:
-        *shown, exact = room.files(f"{take.name} character", (solved, body, factor),
-                                   lambda folder: _character(body, take, place(folder), factor))
+        *shown, exact = context.files(f"{take.name} character", (solved, body, factor),
+                                      lambda folder: _character(body, take, place(folder), factor))
         metrics += exact
     start = clocks()
-    room.files(f"{take.name} page", (solved, metrics, settings, shown and (shown, factor)), page)
+    context.files(f"{take.name} page", (solved, metrics, settings, shown and (shown, factor)), page)
     return metrics, clocks() - start
 
 

@@ -70,7 +70,7 @@ def animate(subject: Subject, markers: MarkerSequence, layout: MarkerLayout, con
 
     [SCAPE] §8
     """
-    config, tell = config or AnimateConfig(), progress or (lambda done, total: None)
+    config, report_progress = config or AnimateConfig(), progress or (lambda done, total: None)
     # the markers that sequence and layout have in common, on the body
     columns, known_layout = layout.match_columns(markers.labels)
     targets = markers.positions[:, columns]
@@ -78,9 +78,10 @@ def animate(subject: Subject, markers: MarkerSequence, layout: MarkerLayout, con
     # all frames together, or one after the other
     if config.smoothing or config.ground:
         start = None if near is None else body.body.join(near.poses, near.trans)
-        x, order, converged = follow_whole(body, targets, markers.rate, config, tell, start)
+        x, order, converged = follow_whole(body, targets, markers.rate, config, report_progress, start)
     else:
-        x, order, converged = follow_frames(body, targets, np.arange(len(targets)), markers.rate, config, tell)
+        x, order, converged = follow_frames(body, targets, np.arange(len(targets)), markers.rate, config,
+                                            report_progress)
     pose, trans, _ = body.body.split(x)
     if config.low_pass:
         pose, trans = low_pass(pose, trans, markers.rate, config.low_pass)
@@ -94,7 +95,7 @@ def animate(subject: Subject, markers: MarkerSequence, layout: MarkerLayout, con
 
 
 def follow_frames(body: MarkedBody, targets: np.ndarray, frames: np.ndarray, rate: float, config: AnimateConfig,
-                  tell: Progress, steps: int = STEPS) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+                  report_progress: Progress, steps: int = STEPS) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Solve some frames in sequence, `rate` of them a second: from the first full frame forwards, then backwards.
 
     Returned are unknowns (n, P), the columns of targets (T, L, 3) of each marker (n, L), and which frames converged
@@ -112,11 +113,11 @@ def follow_frames(body: MarkedBody, targets: np.ndarray, frames: np.ndarray, rat
             x[i], converged[i] = tracker.push(targets[frames[i]])
             order[i] = tracker.watch.order
             done += 1
-            tell(done, len(frames))
+            report_progress(done, len(frames))
     return x, order, converged
 
 
-def follow_whole(body: MarkedBody, targets: np.ndarray, rate: float, config: AnimateConfig, tell: Progress,
+def follow_whole(body: MarkedBody, targets: np.ndarray, rate: float, config: AnimateConfig, report_progress: Progress,
                  start: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Solve all frames together; return unknowns (T, P), the order of labels (T, L) and which frames converged (T,).
 
@@ -140,7 +141,7 @@ def follow_whole(body: MarkedBody, targets: np.ndarray, rate: float, config: Ani
         x[inside] = body.smooth_step(near, stiffness, body.system, taken, weights) if feet is None else \
             body.smooth_step(near, stiffness, feet.system, taken, weights, feet.target_positions(x)[inside])
         moved[inside] = np.linalg.norm(body.positions(x[inside]) - body.positions(near), axis=2).max(axis=1)
-        tell(round(T * (i + 1) / rounds), T)
+        report_progress(round(T * (i + 1) / rounds), T)
     return x, order, (~np.isnan(targets[..., 0])).any(axis=1) & (moved < STILL)
 
 

@@ -135,7 +135,7 @@ def follow_soft_tissue(model: BodyModel, motion: Motion, markers: MarkerSequence
 
     [MoSh] Eq. 24
     """
-    config, tell = config or SoftTissueConfig(), progress or (lambda done, total: None)
+    config, report_progress = config or SoftTissueConfig(), progress or (lambda done, total: None)
     if not model.n_betas:
         raise ValueError("model: expected one with betas, this one knows its template's body only")
     if motion.betas is None or len(motion.betas) > model.n_betas:
@@ -163,10 +163,10 @@ def follow_soft_tissue(model: BodyModel, motion: Motion, markers: MarkerSequence
         x[used] = follower.step_poses(x[used], targets[used], share[used], feet,
                                       None if feet is None else feet.target_positions(x)[used])
         last[used] = np.linalg.norm(body.positions(x[used]) - before, axis=2).max(axis=1)
-        tell(round(T * (i + 1) / (ROUNDS + 1)), T)
+        report_progress(round(T * (i + 1) / (ROUNDS + 1)), T)
     # the movement, given the poses, and the residuals with it
     added, changes, skin = follower.solve_movement(x, used, share)
-    tell(T, T)
+    report_progress(T, T)
     pose, trans, _ = body.body.split(x)
     residuals = np.full(markers.positions.shape[:2], np.nan)
     residuals[:, follower.rows] = np.linalg.norm(body.positions(x) + added - targets, axis=2)

@@ -22,7 +22,7 @@ def mean_person(mean: Subject, layout: MarkerLayout) -> MarkedBody:
     return MarkedBody(mean, layout, MEAN_PERSON.prior_weight, MEAN_PERSON.prior_shrinkage)
 
 
-def start_frames(body: MarkedBody, targets: np.ndarray, tell: Callable[[int], None]) -> np.ndarray:
+def start_frames(body: MarkedBody, targets: np.ndarray, report_progress: Callable[[int], None]) -> np.ndarray:
     """Find unknowns (B, 3J + 3) for frames of markers (B, L, 3), metres: the fullest by a search, others from it."""
     found: list[np.ndarray] = []
     order = np.argsort(np.isnan(targets[..., 0]).sum(axis=1), kind="stable")
@@ -32,7 +32,7 @@ def start_frames(body: MarkedBody, targets: np.ndarray, tell: Callable[[int], No
         if found and np.nanmedian(np.linalg.norm(body.positions(x) - targets[i], axis=1)) > 0.1:
             x = search_pose(body, targets[i], MEAN_PERSON)
         found.append(x)
-        tell(len(found))
+        report_progress(len(found))
     return np.array(found)[np.argsort(order)]
 
 

@@ -157,12 +157,12 @@ def find_person(model: BodyModel, sequences: MarkerSequence | Sequence[MarkerSeq
     # markers of the layout, and the frames to use
     known, positions = common_markers(sequences, layout)
     chosen, stages = choose_frames(positions, config), len(config.annealing)
-    targets, tell = np.concatenate(positions)[chosen], progress or (lambda done, total: None)
+    targets, report_progress = np.concatenate(positions)[chosen], progress or (lambda done, total: None)
     total, inputs = len(chosen) + stages, (model, known, targets, config)
 
     # the poses of the mean person in these frames, then everything together, stage by stage
     mean = mean_person(model.subject(np.zeros(min(config.n_betas, model.n_betas))), known)
-    x = step("person, start", inputs, lambda: start_frames(mean, targets, lambda done: tell(done, total)))
+    x = step("person, start", inputs, lambda: start_frames(mean, targets, lambda done: report_progress(done, total)))
     fit = LatentFit(model, known, targets, config)                                          # [MoSh] Eq. 15
     state, steps, converged = fit.start(x), 0, False
     for i, factor in enumerate(config.annealing):
@@ -172,7 +172,7 @@ def find_person(model: BodyModel, sequences: MarkerSequence | Sequence[MarkerSeq
         rows, converged, taken = step(f"person, stage {i}", inputs,
                                       partial(fit.solve, state, factor, last))              # [MoSh] Eq. 23
         state, steps = state.with_unknowns(rows), steps + taken
-        tell(len(chosen) + i + 1, total)
+        report_progress(len(chosen) + i + 1, total)
 
     # number frames within their sequence, and collect the result
     ends, (pose, trans) = np.cumsum([len(each) for each in positions]), fit.split(state.x)

@@ -55,10 +55,10 @@ def bake_displacement(control: ControlModel, scan: Mesh, config: DisplacementCon
 
     [Statues] Eq. 19, 20, 21
     """
-    config, tell = config or DisplacementConfig(), progress or (lambda done, total: None)
+    config, report_progress = config or DisplacementConfig(), progress or (lambda done, total: None)
     ready = ReadyScan(scan)
     result = find_heights(control, ready, config)
-    tell(1, 2)
+    report_progress(1, 2)
     texels, heights = result.texels, result.heights
     coverage = np.where(result.folded, FOLDED, np.where(result.known, MEASURED, HOLE)).astype(np.uint8)
     coverage[~texels.inside] = OUTSIDE
@@ -74,7 +74,7 @@ def bake_displacement(control: ControlModel, scan: Mesh, config: DisplacementCon
         more[which] = (lattice.sample(u, faces, bary)
                        - result.heights[which, None] * interpolate(control.mesh, faces, bary)[1])
         vectors = texels.image(more.astype(np.float32))
-    tell(2, 2)
+    report_progress(2, 2)
     return DisplacementMap(texels.image(heights.astype(np.float32)), texels.image(coverage, OUTSIDE), vectors)
 
 

@@ -121,16 +121,16 @@ def fit_surface(rest: Mesh, start: np.ndarray, scan: Mesh, config: SurfaceFitCon
         raise ValueError(f"start: expected shape {rest.vertices.shape}, got {start.shape}")
     if not len(scan.faces):
         raise ValueError(f"scan: expected at least one triangle, got {scan}")
-    fit, tell = _Fit(rest, start, scan, config, hidden), progress or (lambda done, total: None)
+    fit, report_progress = _Fit(rest, start, scan, config, hidden), progress or (lambda done, total: None)
     x, temperatures = start, fit.schedule(start)
     total = len(temperatures) + config.polish
     for k, T in enumerate(temperatures, 1):
         most = config.most if k < len(temperatures) else 10 * config.most
         x, converged = fit.anneal(x, T, most)                                                  # [Statues] Eq. 16-18
-        tell(k, total)
+        report_progress(k, total)
     for k in range(config.polish):
         x = fit.polish(x)
-        tell(len(temperatures) + k + 1, total)
+        report_progress(len(temperatures) + k + 1, total)
     if config.polish:
         x = fit.onto_the_surface(x)
     seen, _ = fit.find_data(x)
