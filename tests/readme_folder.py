@@ -50,7 +50,7 @@ SET_UP = {"pip install . && scape demo", 'pip install ".[test]" && pytest'}
 def documents(part):
     """The documents of a part that exist, as paths from the root."""
     pages = sorted((ROOT / ".docs" / "pages").rglob("*.md"))
-    everything = [README, *sorted(path.relative_to(ROOT).as_posix() for path in ROOT.glob("*/README.md")),
+    everything = [README, *sorted(path.relative_to(ROOT).as_posix() for path in ROOT.glob("[a-z]*/README.md")),
                   *(path.relative_to(ROOT).as_posix() for path in pages)]
     named = {one: [name if name.endswith(".md") else f".docs/pages/{name}.md" for name in names]
              for one, names in PARTS.items()}
