@@ -96,7 +96,7 @@ def as_ours(theirs: Any, name: str, progress: Progress | None = None) -> Skinnin
     # the model without correctives, then the correctives of one joint after the other
     regressor = joint_rows(template.vertices, joints, shapes, moved)
     published = Published(template, np.moveaxis(shapes, 0, -1), np.zeros((*template.vertices.shape, 0)), regressor,
-                      body.weights, body.parents, body.names, {}, ())
+                          body.weights, body.parents, body.names, {}, ())
     plain = as_skinning(published, {})
     bends = []
     for j in range(1, J):

@@ -376,7 +376,7 @@ class ShapedCondensed(ShapedPoints):
         reach, place = system.reach(used), system.place_of[used]
         # of every part, the tables of both bodies and of all betas are rows of one product: border, then inside
         for part, inside, chosen, own, mean in zip(system.parts, system.inside, self._slices, self.own.tables,
-                                                 self.mean.tables, strict=True):
+                                                   self.mean.tables, strict=True):
             rows = np.concatenate([own.reshape(1, -1), mean.reshape(1, -1), self.flat[:, chosen]])
             rows = rows.reshape(-1, mean.shape[2])
             moved = rows[:, len(part.inside):] @ reach[part.loads]

@@ -139,7 +139,7 @@ def _skeleton(published: Published) -> Skeleton:
     if not published.names and np.array_equal(published.parents[:22], PARENTS) and known:
         return Skeleton(part, published.parents, joints, known)
     return plain if published.names else Skeleton(part, published.parents, joints,
-                                              name_parts(mesh, plain, find_symmetry(mesh)))
+                                                  name_parts(mesh, plain, find_symmetry(mesh)))
 
 
 def _poses(mesh: Mesh, skeleton: Skeleton, hands: dict[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -84,7 +84,7 @@ def run(function: Callable[..., Outcome], prog: str, argv: list[str]) -> int:
 def settings_file(function: Callable[..., Outcome], argv: list[str]) -> str | None:
     """Return the settings file that `--write-config` asks for; None where it was not given."""
     defaults = {p.name: p.default for p in inspect.signature(function).parameters.values()
-             if isinstance(p.default, ranges.Settings)}
+                if isinstance(p.default, ranges.Settings)}
     if not defaults or "--write-config" not in argv:
         return None
     settings = _Settings(defaults, argv)

@@ -40,4 +40,4 @@ def demo(out: Out = Path("scape_demo"), quick: bool = False, full: bool = False,
         write_page(run, metrics, judgement, progress, staged.folder)
     return Outcome(out, metrics, {"demo": run.config}, judgement=judgement,
                    following=f"open {out / 'report.html'} in a browser; then your own scans: "
-                             "scape prep run scans --template template.ply -o set")
+                   "scape prep run scans --template template.ply -o set")

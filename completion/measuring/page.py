@@ -31,7 +31,7 @@ def measures_page(names: Sequence[str], bodies: Sequence[np.ndarray], measured: 
     for first in shown[::BESIDE_EACH_OTHER]:
         group = shown[first:first + BESIDE_EACH_OTHER]
         caption = "" if first else ("Red: girths, a tape that spans hollows. Blue: lengths along the skin and widths. "
-                                 "Grey, beside the body: heights. Drag to turn; the list hides and shows them.")
+                                    "Grey, beside the body: heights. Drag to turn; the list hides and shows them.")
         page.bodies([_pane(names[k], bodies[k], measured[k], tapes, len(group) == 1) for k in group], caption,
                     560 if len(group) < 3 else 420)
     if len(names) > SHOWN:

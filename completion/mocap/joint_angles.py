@@ -65,9 +65,9 @@ class SegmentAxes:
         known = {"ground", *self.parts}
         possible = [Joint(names, *rest, False) for names, rest in _MIDDLE.items()]
         possible += [Joint((f"{a}_{side}", f"{b}_{side}", f"{c}_{side}"),
-                        proximal if proximal in ("pelvis", "trunk") else f"{proximal}_{side}", f"{distal}_{side}",
-                        sequence, signs, side == "l")
-                  for side in "rl" for (a, b, c), (proximal, distal, sequence, signs) in _SIDED.items()]
+                           proximal if proximal in ("pelvis", "trunk") else f"{proximal}_{side}", f"{distal}_{side}",
+                           sequence, signs, side == "l")
+                     for side in "rl" for (a, b, c), (proximal, distal, sequence, signs) in _SIDED.items()]
         return [joint for joint in possible if {joint.proximal, joint.distal} <= known]
 
     def missing(self) -> tuple[str, ...]:

@@ -179,7 +179,7 @@ def complete(body: BodyModel | Subject, scan: Scan, landmarks: tuple[np.ndarray,
     if start is not None and config is not None and config.free_scale:
         raise ValueError("start: expected none where the unit of the scan is not known")
     # check the input and bring scan and landmarks into metres
-    config, report_progress = config or CompletionConfig(), progress or (lambda result, total: None)
+    config, report_progress = config or CompletionConfig(), progress or (lambda done, total: None)
     total, person = config.rounds + 3, as_body(body)
     solve = solve_jointly if config.method == "joint" else turns_of(body, config)
     inputs = prepare_in_metres(person, scan, landmarks, masked, config)
@@ -192,7 +192,7 @@ def complete(body: BodyModel | Subject, scan: Scan, landmarks: tuple[np.ndarray,
     x, rival = with_limbs(fit, sparse, best_starts(sparse, starts))
     report_progress(2, total)
     # fit pose, shape and place to the scan
-    solved = solve(fit, sparse, x, lambda result: report_progress(2 + result, total))       # [SCAPE] Eq. 10, Eq. 11
+    solved = solve(fit, sparse, x, lambda done: report_progress(2 + done, total))       # [SCAPE] Eq. 10, Eq. 11
     x, factor = fit.body.in_metres(solved.x)
     open_error = factor * posterior_error(fit.body, solved.x, fit.precision(solved.x))
     inputs = inputs.scale_by(factor)
@@ -214,8 +214,8 @@ def complete(body: BodyModel | Subject, scan: Scan, landmarks: tuple[np.ndarray,
     distances = np.linalg.norm(predicted.vertices[inputs.vertices] - inputs.points, axis=1)
     landmark_rms = float(np.sqrt((distances**2).mean())) if len(distances) else np.nan
     result = Completion(completed, predicted, pose, shape, trans, seen, rms, float(used.mean()), landmark_rms,
-                      solved.converged, solved.rounds, solved.energies, inputs.metres, error,
-                      probability_within(error, config.tolerance), soles=standing.beyond if standing else None)
+                        solved.converged, solved.rounds, solved.energies, inputs.metres, error,
+                        probability_within(error, config.tolerance), soles=standing.beyond if standing else None)
     # judge the result: reasons why it means nothing, then reasons to look at it
     problems = [completion_problem(result, inputs.cloud.points, config.free_scale),
                 find_contortion(fit, solved.x, float(seen.mean()), len(distances) > 0)]
@@ -263,7 +263,7 @@ def completion_doubts(fit: ScanFit, x: np.ndarray, error: np.ndarray, seen: np.n
     # joints far from every known pose
     strange = fit.body.joints_from_known(fit.body.split(x)[0])
     doubts += [f"the {joint_in_words(names[j])} is {np.degrees(strange[j]):.0f} degrees from any way that it is known "
-              "to be held" for j in np.argsort(-strange) if strange[j] > STRANGE]
+               "to be held" for j in np.argsort(-strange) if strange[j] > STRANGE]
     # a model that is inexact on poses it was not learned from
     if (left_out := fit.body.left_out_error) is not None and left_out > CRUDE:
         doubts.append(f"the model was {1000 * left_out:.0f} mm off in poses that it was not learned from: "

@@ -122,10 +122,10 @@ def tracking_doubts(motion: Motion, body: Mesh) -> list[str]:
     seen = np.isfinite(motion.residuals[:, 0])
     lost, off = seen & ~motion.converged, float(motion.residuals[seen].mean()) if seen.any() else 0.0
     doubts = [f"the body was lost in {lost.sum()} of {seen.sum()} frames that show something: frames in another order, "
-             "or too far apart?"] if lost.sum() > LOST_FRAMES * seen.sum() else []
+              "or too far apart?"] if lost.sum() > LOST_FRAMES * seen.sum() else []
     # 0.01 of the size: people have 1 to 2 mm, 3 with noise; half the size 21 mm, shuffled frames 19 mm
     return doubts + ([f"the points are {1000 * off:.0f} mm from the body: the wrong scale, frames in another order, or "
-                     "clothes?"] if off > 0.01 * size(body) else [])
+                      "clothes?"] if off > 0.01 * size(body) else [])
 
 
 def tracking_problem(motion: Motion) -> str | None:

@@ -48,7 +48,7 @@ def as_columns(motion: Motion, subject: Subject, frames: np.ndarray) -> tuple[np
     # the body's place, expressed in the columns
     place = (subject.origin + motion.trans)[:, None] * basis.sum(axis=0)[:, None]
     relative = np.concatenate([columns.relative_positions(motion.poses[i:i + AT_ONCE])
-                          for i in range(0, len(motion.poses), AT_ONCE)])
+                               for i in range(0, len(motion.poses), AT_ONCE)])
     return basis, np.swapaxes(relative, 1, 2) + place
 
 

@@ -119,7 +119,7 @@ def sample(model: ModelArg, output: Output, count: Annotated[Count, Alias("-n")]
         Metric("bodies", count), *rows, Metric("shape components", drawn.betas.shape[1]),
         Metric("largest extent, smallest body", float(extent.min()), "m"),
         Metric("largest extent, largest body", float(extent.max()), "m")],
-        {"seed": seed, "pose_too": pose_too, "sex": sex}, judgement=Judgement())
+                   {"seed": seed, "pose_too": pose_too, "sex": sex}, judgement=Judgement())
 
 
 def _notes(model: BodyModel, posed: np.ndarray | None, people: np.ndarray | None) -> list[str]:
@@ -177,7 +177,7 @@ def _write_tables(output: Path, model: BodyModel, found: Findings) -> None:
                 zip(found.shapes.counts, found.shapes.errors, found.shapes.converged, strict=True)
                 for row in _rows(found.shape_names, errors, converged)]
         write_table(output / "people.csv", ["components", "name", "mean_mm", "p95_mm", "worst_mm", *parts, "converged"],
-                   rows)
+                    rows)
 
 
 def _rows(names: Sequence[str], errors: Errors, converged: np.ndarray) -> list[list[Any]]:

@@ -81,7 +81,7 @@ def motion_correctives(rig: Rig, subject: Subject, poses: np.ndarray, count: int
     # weights of every frame from a few points, by the pseudo-inverse of the correctives there
     ids = farthest_points(rig.mesh.vertices, min(POINTS, len(rig.mesh.vertices)))
     points_rig = replace(rig, mesh=Mesh(rig.mesh.vertices[ids], np.zeros((0, 3))), weights=rig.weights[ids],
-                  shapes=np.zeros((0, len(ids), 3)), correctives=None)
+                         shapes=np.zeros((0, len(ids), 3)), correctives=None)
     solve = np.linalg.pinv(basis[:, ids].reshape(len(basis), 3 * len(ids)))
     points, weights = subject.points(ids), np.empty((len(poses), len(basis)))
     for start in range(0, len(poses), AT_ONCE):

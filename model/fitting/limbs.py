@@ -81,7 +81,7 @@ def find_misplaced_limbs(fit: ScanFit, x: np.ndarray, least: float = AMISS) -> l
         wrong[ids] += weight * np.minimum(found.excess, CAP)**2 / len(ids)
     lost, strange = fit.thin.points[fit.find_unexplained(x, fit.thin)], fit.strange(x)
     misplacements = {tuple(limb): misplacement(fit, x, limb, wrong, lost) + float(strange[limb].sum())
-                   for limb in limb_runs(fit.body.skeleton)}
+                     for limb in limb_runs(fit.body.skeleton)}
     return [list(limb) for limb in sorted(misplacements, key=lambda limb: -misplacements[limb])
             if misplacements[limb] > least]
 

@@ -343,7 +343,7 @@ class ScanFit:
         config, places, normals = self.config, skin.places, skin.normals
         mine = self.sample.matched
         out = [(config.contact_weight, self.sample.spread, self.sample.contact.violation(places[self.sample.spread],
-                                                                             normals[self.sample.spread]))]
+                                                                                         normals[self.sample.spread]))]
         if self.data.cameras:
             out.append((config.free_space_weight, mine, free_space_violation(self.data.cameras, places[mine])))
         if self.data.clothing is not None:
@@ -367,7 +367,7 @@ def scan_fit(body: FixedBody, cloud: ScanPoints, vertices: np.ndarray, points: n
 
 
 def prepare_scan_fit(body: FixedBody, scan: Mesh | np.ndarray, vertices: np.ndarray, points: np.ndarray,
-                   config: ScanFitConfig) -> tuple[ScanFit, float]:
+                     config: ScanFitConfig) -> tuple[ScanFit, float]:
     """Prepare the fit of a body of any size to a scan; also return the factor by which both were scaled.
 
     The lengths of the search suit a person, so a hand or a horse is scaled to that size. `vertices` (L,) int and

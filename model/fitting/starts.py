@@ -60,7 +60,7 @@ def from_landmarks(fit: ScanFit, few: ScanFit, vertices: np.ndarray, points: np.
     x = x[distinct_bodies(body.subject.points(few.ids[few.sample.spread]).evaluate(*body.split(x)[:2]), candidates)]
     drawn = np.concatenate([x, *(sample_around(body, follow, start, points, sd, fit.prior, fit.config.random_starts,
                                                fit.rng)
-                                for start in x)])
+                                 for start in x)])
     drawn = np.hstack([drawn, np.zeros((len(drawn), fit.body.n_betas))])
     drawn = drawn[np.argsort(coarse_cost(few, drawn))]
     return drawn[distinct_bodies(sample_vertices(few, drawn), candidates)]

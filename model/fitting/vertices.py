@@ -166,7 +166,7 @@ class PoseFitter:
         best: Minimum[np.ndarray] | None = None
         for x in _starts(subject, vertices) if start is None else [_unknowns_of_pose(subject, vertices, start)]:
             end = _minimise(_equations(self._sample, vertices[chosen]), x[None], J, config.iterations,
-                              config.tolerance)
+                            config.tolerance)
             if best is None or end.energy[0] < best.energy[0]:
                 best = end
             if np.sqrt(end.energy[0] / len(chosen)) < 0.02 * np.ptp(vertices, axis=0).max():

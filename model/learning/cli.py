@@ -132,8 +132,9 @@ def learn(poses: Path, output: Output, shapes: Path | None = None, template: Pat
         *_about_prior(models["neutral"]),
         *[Metric(f"people of the {name} model", model.info["shapes"]) for name, model in models.items() if by_sex],
         *details([Metric("kind", models["neutral"].kind), Metric("triangles", len(body.faces)), *_about_steps(step)])],
-        {"scape": scape, "skinning": skinning, "mixed": mixed}, judgement=judge_model(models["neutral"], people),
-        following=f"look at it: scape view {output}")
+                   {"scape": scape, "skinning": skinning, "mixed": mixed},
+                   judgement=judge_model(models["neutral"], people),
+                   following=f"look at it: scape view {output}")
 
 
 def _about_steps(step: KeptSteps) -> list[Metric]:

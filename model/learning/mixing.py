@@ -135,7 +135,7 @@ def _next_round(mix: Mix, state: MixingState, number: int, work: ProgressShares)
     for person in range(len(S) if number else 0):
         own = mix.who == person
         poses[own] = fit_poses(mix.parts.subject(state.space, S[person]), mix.bodies[own], poses[own],
-                                ProgressShares(None))
+                               ProgressShares(None))
         work.tick(float(own.mean()))
     space, design = _learn_pose(mix, MixingState(poses, state.space, S, state.design))         # [SCAPE] Eq. 4, Eq. 5
     return MixingState(poses, space, _learn_people(mix, poses, space), design)                # [SCAPE] Eq. 8

@@ -101,7 +101,7 @@ def check_wanted(given: Mapping[str, float]) -> dict[str, float]:
                 unit = "metres" if usual.unit == "m" else "kilograms"
                 seems = [(factor * value, other) for other, factor in (
                     factors if usual.unit == "m" else heavy_factors).items()
-                    if usual.low <= factor * value <= usual.high]
+                         if usual.low <= factor * value <= usual.high]
                 hint = (f"; it is in {unit}: did you mean {word}={seems[0][0]:.4g}, which is {value:g} {seems[0][1]}?"
                         if seems else f"; the nearest is {word}={float(np.clip(value, usual.low, usual.high)):g}")
                 do = "measure there" if usual.unit == "m" else "weigh"

@@ -52,6 +52,6 @@ def resample_model(model: ModelArg, output: Output, template: Path | None = None
         Metric("triangles", len(mesh.faces)),
         *(Metric(f"distance in {measured} random poses, {who}, {what}", 1000.0 * float(value), "mm")
           for who, gap in gaps for what, value in (("mean", gap.mean()), ("worst pose", gap.max())))],
-        {"resample": config}, judgement=Judgement.of(check=[
+                   {"resample": config}, judgement=Judgement.of(check=[
             f"{who} in random poses: {1000 * float(gap.mean()):.0f} mm from where it was; take more vertices"
             for who, gap in gaps if gap.mean() > 0.01]))

@@ -180,7 +180,7 @@ def judge_statue(statue: FittedStatue, scan: Mesh, finest: Level, left_out: Sequ
     posed, shares = statue.posed, coverage_shares(statue.control, statue.map)
     assert posed is not None, "made by fit_statue"
     summary = (f"{100 * shares['folded']:.0f}% of the control mesh is folded against the scan, "
-            f"{100 * shares['measured']:.0f}% has data one-to-one")
+               f"{100 * shares['measured']:.0f}% has data one-to-one")
     missed = share_uncovered(scan, finest.mesh, 0.01 * float(np.sqrt(scan.face_areas.sum())))
     failed, check = [], list(left_out)
     # shares of the control mesh. Folded: standing persons have up to 0.014, dressed ones 0.07 to 0.13, half a person

@@ -72,7 +72,7 @@ def statue_page(name: str, scan: Mesh, statue: Statue, levels: Sequence[Level], 
         Bones(joints[control.skeleton.parents[1:]], joints[1:], on_top=True, name="skeleton"),
         Dots(joints, on_top=True, name="joints", labels=control.skeleton.names),
         Dots(control.mesh.vertices[marks], (0.15, 0.45, 0.75), 0.006, True, name="feature points", labels=names)],
-        cameras(statue, scan, (20,))[0])], height=HEIGHT)
+                      cameras(statue, scan, (20,))[0])], height=HEIGHT)
     page.section("Displacement map", "White: the scan lies outside the control mesh, black: inside. Right: blue was "
                  "measured; red is folded, not one-to-one with the control mesh; yellow is a hole of the scan. Red and "
                  "yellow were filled smoothly.")

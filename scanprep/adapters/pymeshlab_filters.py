@@ -38,10 +38,10 @@ def read_layers(path: str) -> dict[str, np.ndarray]:
     counts = [layer.vertex_number() for layer in layers]
     starts = np.cumsum([0, *counts[:-1]])
     arrays = {"vertices": np.concatenate([layer.transformed_vertex_matrix() for layer in layers]),
-             "faces": np.concatenate([layer.face_matrix().astype(np.int64) + start
-                                      for layer, start in zip(layers, starts, strict=True)]),
-             "names": np.array([layer.label() or f"layer {k}" for k, layer in enumerate(layers)]),
-             "triangles": np.array([layer.face_number() for layer in layers])}
+              "faces": np.concatenate([layer.face_matrix().astype(np.int64) + start
+                                       for layer, start in zip(layers, starts, strict=True)]),
+              "names": np.array([layer.label() or f"layer {k}" for k, layer in enumerate(layers)]),
+              "triangles": np.array([layer.face_number() for layer in layers])}
     if all(layer.has_vertex_color() for layer in layers):
         arrays["colors"] = np.concatenate([layer.vertex_color_matrix()[:, :3] for layer in layers])
     return arrays

@@ -177,7 +177,7 @@ def _place(source_view: tuple[np.ndarray, np.ndarray, np.ndarray],
 
 
 def _refine(p: np.ndarray, n: np.ndarray, tree: OrientedPoints, R: np.ndarray, t: np.ndarray,
-             extent: float) -> tuple[np.ndarray, np.ndarray]:
+            extent: float) -> tuple[np.ndarray, np.ndarray]:
     """Refine a motion by twelve rounds of point-to-point ICP with falling reach."""
     for reach in extent * np.linspace(1 / 30, 1 / 90, 12):
         match = tree.match(p @ R.T + t, n @ R.T, reach, 0.6)

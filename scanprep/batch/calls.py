@@ -36,7 +36,7 @@ class KeptCall:
         stored: dict[str, Any] = {f.name: with_paths(getattr(self, f.name), Path.absolute) for f in fields(self)}
         # a text that names an existing file becomes an absolute path; a keyword stays as it is
         stored |= {name: str(Path(stored[name]).absolute()) for name in self.may_be_files
-                  if stored[name] is not None and Path(stored[name]).exists()}
+                   if stored[name] is not None and Path(stored[name]).exists()}
         stored["config"] = config_files.write_settings({"config": stored["config"]})
         storage.write_json(folder / RUN, {"kind": _kind(self), "version": VERSION, **stored})
 

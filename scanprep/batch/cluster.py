@@ -144,7 +144,7 @@ def do_there(shared: bytes, packed: bytes) -> tuple[Any, dict[str, bytes], list[
             return outcome, {}, notes
         # read the results back, as this folder is temporary
         written_files = {path.relative_to(here / "made").as_posix(): path.read_bytes()
-                for path in sorted((here / "made").rglob("*")) if path.is_file()}
+                         for path in sorted((here / "made").rglob("*")) if path.is_file()}
     return outcome, written_files, notes
 
 

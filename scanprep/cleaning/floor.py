@@ -69,8 +69,8 @@ def find_plane(points: np.ndarray, min_area: float, rng: np.random.Generator) ->
     height = plane.height(points)
     on_it = np.abs(height) <= plane.thickness
     if (plane.noise > 2 * local_noise(points, rng)           # curved surface such as a back is no floor
-            or np.mean(height < -WIDEST / 2) > most_below
-            or _area_of_cells(plane.flat(points[on_it]), WIDEST) < min_area):
+        or np.mean(height < -WIDEST / 2) > most_below
+        or _area_of_cells(plane.flat(points[on_it]), WIDEST) < min_area):
         return None
     return plane
 

@@ -285,7 +285,7 @@ def _cuts_that_meet_nothing(sizes: np.ndarray, corners: np.ndarray, count: int) 
     # for crowded polygons, try each corner and take the one whose diagonals meet fewest others
     users: dict[int, list[int]] = {}
     for key, p in zip(np.r_[sides, cuts[~crowded]].tolist(), np.r_[np.repeat(np.arange(len(sizes)), sizes),
-                                                                  of[~crowded]].tolist(), strict=True):
+                                                                   of[~crowded]].tolist(), strict=True):
         users.setdefault(key, []).append(p)
     rings = [set(ring.tolist()) for ring in np.split(corners, start[1:])]
     for p in np.unique(of[crowded]):

@@ -154,8 +154,8 @@ def encode(contents: Contents, double: bool) -> bytes:
     if contents.colors is not None:
         packed = quantise_colors(contents.colors).astype(np.uint32) @ np.array([1 << 16, 1 << 8, 1], dtype=np.uint32)
     rows = as_rows([(("x", "y", "z"), "f8" if double else "f4", contents.vertices),
-                       (("normal_x", "normal_y", "normal_z"), "f4", contents.normals),
-                       (("rgb",), "u4", None if packed is None else packed[:, None])])
+                    (("normal_x", "normal_y", "normal_z"), "f4", contents.normals),
+                    (("rgb",), "u4", None if packed is None else packed[:, None])])
     fields = fields_of(rows)
     lines = ["VERSION 0.7", "FIELDS " + " ".join(n for n, _ in fields),
              "SIZE " + " ".join(k[2] for _, k in fields), "TYPE " + " ".join(k[1].upper() for _, k in fields),

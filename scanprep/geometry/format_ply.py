@@ -313,7 +313,7 @@ def encode(contents: Contents, double: bool) -> bytes:
     """Encode a binary little-endian PLY file; coordinates as `double` or, smaller, as `float`."""
     number = "f8" if double else "f4"
     rows = as_rows([(("x", "y", "z"), number, contents.vertices), (("nx", "ny", "nz"), number, contents.normals),
-                       (_COLORS[0], "u1", None if contents.colors is None else quantise_colors(contents.colors))])
+                    (_COLORS[0], "u1", None if contents.colors is None else quantise_colors(contents.colors))])
     words = {"<f8": "double", "<f4": "float", "|u1": "uchar"}
     header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(rows)}"]
     header += [f"property {words[kind]} {name}" for name, kind in fields_of(rows)]

@@ -195,7 +195,7 @@ def _table(lines: Lines) -> _Points:
     if name is None or not {"x", "y", "z"} <= {*columns}:
         raise lines.fail(0, "a heading with name, x, y, z")
     return [_point_of_row(lines, row, dict(zip(columns, _cells(lines, row, mark), strict=False)), name,
-                         mark.join(columns)) for row in range(1, len(lines))]
+                          mark.join(columns)) for row in range(1, len(lines))]
 
 
 def _cells(lines: Lines, row: int, mark: str) -> list[str]:

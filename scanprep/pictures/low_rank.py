@@ -44,7 +44,7 @@ def low_rank(frames: np.ndarray, tolerance: float = TOLERANCE) -> tuple[np.ndarr
         coefficients = np.einsum("nr,tnc->trc", basis, frames, optimize=True)
         # frames that the columns do not reproduce join the ones they are computed from, the worst first
         errors = np.array([np.abs(basis @ c - frame).max(initial=0)
-                        for c, frame in zip(coefficients, frames, strict=True)])
+                           for c, frame in zip(coefficients, frames, strict=True)])
         failing = np.setdiff1d(np.flatnonzero(errors > tolerance), chosen)
         if not len(failing) or len(chosen) >= MOST or basis.shape[1] == points:
             return basis, coefficients

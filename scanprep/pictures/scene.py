@@ -75,8 +75,8 @@ def pack_scene(panes: Sequence[Pane], whole: bool = False) -> bytes:
 def small_scene(panes: Sequence[Pane]) -> bytes:
     """Pack a scene with fewer triangles, for a page of many results."""
     thinned = [replace(pane, shapes=[thin_solid(shape if isinstance(shape, Solid) else Solid(shape), SMALL)
-                                 if isinstance(shape, Solid | Mesh) else shape for shape in pane.shapes])
-           for pane in match_camera_scales(panes)]
+                                     if isinstance(shape, Solid | Mesh) else shape for shape in pane.shapes])
+               for pane in match_camera_scales(panes)]
     return pack_scene(thinned)
 
 
@@ -143,15 +143,15 @@ def _layer(shape: Shape | Moving, origin: np.ndarray, columns: _Columns, whole: 
         first = shape.color if isinstance(shape.color, Heat) else own_color(shape)
         shades = [_shade(name, shade, shape.mesh, columns) for name, shade in {"": first, **shape.shades}.items()]
         appearance = {"kind": "mesh", "opacity": shape.opacity, "smooth": shape.smooth, "shades": shades,
-                 "faces": columns.add(shape.mesh.faces.astype(np.uint32), True)}
+                      "faces": columns.add(shape.mesh.faces.astype(np.uint32), True)}
     else:
         rods = isinstance(shape, Bones)
         points = np.stack([shape.starts, shape.ends], axis=1) if isinstance(shape, Bones) else shape.points
         color = shape.color if isinstance(shape.color, Heat) else np.asarray(shape.color, dtype=float)
         color = np.repeat(color, 2, axis=0) if rods and not isinstance(color, Heat) and color.ndim == 2 else color
         appearance = {"kind": "bones" if rods else "dots", "radius": shape.radius, "on_top": shape.on_top,
-                 "shades": [_shade("", color, None, columns)],
-                 "labels": list(shape.labels) if isinstance(shape, Dots) else []}
+                      "shades": [_shade("", color, None, columns)],
+                      "labels": list(shape.labels) if isinstance(shape, Dots) else []}
     # points that are not finite cannot be stored: they are listed as hidden
     points = np.asarray(points, dtype=float).reshape(-1, 3) - origin
     known = np.isfinite(points).all(axis=1)

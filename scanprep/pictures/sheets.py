@@ -114,7 +114,7 @@ def gif_bytes(images: Sequence[np.ndarray], rate: float) -> bytes:
     frames = [Image.fromarray(i).quantize(palette=palette, dither=Image.Dither.FLOYDSTEINBERG) for i in images]
     out = io.BytesIO()
     frames[0].save(out, format="GIF", save_all=True, append_images=frames[1:], loop=0,
-                  duration=max(20, round(1000 / rate / 10) * 10), optimize=False)
+                   duration=max(20, round(1000 / rate / 10) * 10), optimize=False)
     return out.getvalue()
 
 

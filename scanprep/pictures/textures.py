@@ -190,7 +190,7 @@ def bake_body_texture(body: Mesh, look: Look, unseen: np.ndarray, size: int = 10
     image = np.full((size * size, 3), unseen.mean())
     image[covered] = np.where(weight[:, None] > 0, colors, plain)
     return Texture(Mesh(body.vertices[old_vertex], faces), uv, pad_charts(image.reshape(size, size, 3),
-                                                                 (face >= 0).reshape(size, size)))
+                                                                          (face >= 0).reshape(size, size)))
 
 
 def unwrap(mesh: Mesh) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

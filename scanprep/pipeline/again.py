@@ -47,5 +47,5 @@ class Call(KeptCall):
             landmarks = landmarks or read_template_landmarks(self.template, template, self.template_landmarks)
             if without:
                 say(f"note: no landmarks for {len(without)} of {len(tasks)} scans ({', '.join(without[:LISTED])}); "
-                     "look at the page for those turned round or mirrored")
+                    "look at the page for those turned round or mirrored")
         return tasks, template, landmarks

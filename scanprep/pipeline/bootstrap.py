@@ -166,7 +166,7 @@ def bootstrap_set(space: Workspace, work: RegisterScan, tasks: Sequence[ScanTask
         again = RegisterAgain(replace(work, lead=replace(lead, name=lead_name)), number)      # type: ignore[type-var]
         # register the doubted scans through it
         inputs = [DoubtedScan(replace(task, model=model), best[task.name].badness if task.name in best else np.inf)
-                 for task in doubted]
+                  for task in doubted]
         done = space.run(again, [Task(prefix + one.scan.name, one) for one in inputs], workers, progress)
         drop_round(space, number, {task.name for task in tasks} - {task.name for task in doubted})
         fresh |= {name.removeprefix(prefix) for name in done.fresh}

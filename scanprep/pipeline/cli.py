@@ -59,7 +59,7 @@ def run_all(scans: ScansArg, template: Path, output: Output, landmarks: Path | N
 
 
 def carry_out(call: Call, inputs: tuple[list[ScanTask], Mesh, dict[str, int]], space: Workspace,
-                *progress: Progress) -> Outcome:
+              *progress: Progress) -> Outcome:
     """Register the scans that have changed into an open set, and keep the call there.
 
     `progress` are up to four callbacks: scans, skeleton, parts of a person, and the steps inside one scan.
@@ -86,7 +86,7 @@ def summarize(call: Call, count: int, prepared: Prepared, space: Workspace) -> O
     return Outcome(space.folder, rows, {"prepare": call.config}, list(prepared.failures),
                    judgement=judge_whole(verdicts, tree),
                    following=f"open {space.folder / 'report.html'}, then "
-                             f"scape learn --poses {space.folder} --shapes {space.folder} -o model.npz")
+                   f"scape learn --poses {space.folder} --shapes {space.folder} -o model.npz")
 
 
 def page(registered: SetArg, limits: Limits = Limits()) -> Outcome:

@@ -226,7 +226,7 @@ def pictures_of(template: Mesh, scan: Mesh | np.ndarray, fit: Registration) -> t
     middle = fit.mesh.vertices.mean(axis=0)
     body = fit.mesh.with_vertices((fit.mesh.vertices - middle) @ R.T)
     front, back = (replace(c, width=1.06 * c.width, height=1.06 * c.height)
-                  for c in look_around(template, body.vertices, (TURN, TURN + 180)))
+                   for c in look_around(template, body.vertices, (TURN, TURN + 180)))
     # the scan, turned like the body, with only as much detail as a small picture shows
     size, ball = size_of(template), 0.013 * size_of(template)
     raw: Solid | Dots

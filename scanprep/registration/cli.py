@@ -71,8 +71,8 @@ def align(source: MeshArg, target: Annotated[Path, Place("TARGET")], output: Out
     return Outcome(output, [
         Metric("RMS distance", MM * alignment.rms, "mm"), Metric("converged", str(alignment.converged)),
         Metric("T_target_source", np.array2string(T, precision=6).replace("\n", " "))], {"align": config},
-        judgement=Judgement.of(alignment_problem(moving.vertices, fixed.vertices, alignment),
-                               [] if alignment.converged else [
+                   judgement=Judgement.of(alignment_problem(moving.vertices, fixed.vertices, alignment),
+                                          [] if alignment.converged else [
             f"it did not converge, at {MM * alignment.rms:.0f} mm RMS: a start far from the target?"]))
 
 
@@ -116,7 +116,7 @@ def correspond(scan: ScanArg, template: Path, output: Output, landmarks: Path | 
         Metric("method", pairs_found.method), *led_by, Metric("correspondences", len(pairs_found)),
         Metric("confidence, median", float(np.median(pairs_found.confidence))),
         Metric("converged", str(pairs_found.converged))], {"correspond": config},
-        judgement=Judgement.of(correspondences_problem(pairs_found), correspondences_doubts(pairs_found)))
+                   judgement=Judgement.of(correspondences_problem(pairs_found), correspondences_doubts(pairs_found)))
 
 
 def register_one(scan: ScanArg, template: Path, output: Output, landmarks: Path | None = None,
@@ -181,7 +181,7 @@ def register_one(scan: ScanArg, template: Path, output: Output, landmarks: Path 
         Metric("inverted triangles", fit.inverted), Metric("limbs rolled otherwise", str(fit.rolled)),
         *soles_row(fit.soles),
         Metric("converged", str(fit.converged))], {"register": config},
-        judgement=judge_registration(scan.name, body, data, fit, pairs, parts, rival is not None))
+                   judgement=judge_registration(scan.name, body, data, fit, pairs, parts, rival is not None))
 
 
 Landmarks = tuple[np.ndarray, np.ndarray]

@@ -109,7 +109,7 @@ def match_term(graph: DeformationGraph, motion: NodeMotion, wanted: QuadraticTar
         blocks = np.matmul(flat.transpose(0, 2, 1), np.matmul(A, flat)).reshape(n, K, UNKNOWNS, K, UNKNOWNS)
         force = np.matmul(flat.transpose(0, 2, 1), (Ax - b)[..., None]).reshape(n * K, UNKNOWNS)
         return (sum_groups(gatherer(pattern.vertex_slots[active].reshape(-1), len(pattern.rows)),
-                       blocks.transpose(0, 1, 3, 2, 4).reshape(n * K * K, UNKNOWNS, UNKNOWNS)),
+                           blocks.transpose(0, 1, 3, 2, 4).reshape(n * K * K, UNKNOWNS, UNKNOWNS)),
                 sum_groups(gatherer(carriers.reshape(-1), pattern.nodes), force))
 
     return Term(float(np.sum(x * (Ax - 2 * b)) + wanted.c), normal)

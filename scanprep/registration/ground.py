@@ -73,7 +73,7 @@ def soles_row(beyond: tuple[float, float] | None) -> list[Metric]:
     """Return the table row that reports how far soles were beyond the floor, before and after, metres; or no row."""
     return [] if beyond is None else [
         Metric("soles", f"the scan ends flat at the floor: soles rest on it, {1000 * beyond[1]:.0f} mm beyond its "
-                        f"end, where they were {1000 * beyond[0]:.0f} mm")]
+               f"end, where they were {1000 * beyond[0]:.0f} mm")]
 
 
 def put_on_floor(reference: Mesh, body: Mesh, foot: np.ndarray, points: np.ndarray, normals: np.ndarray

@@ -120,7 +120,7 @@ def find_exchanged_sides(template: Mesh, parts: PersonParts, vertices: np.ndarra
     if both[limb] <= 45:
         return None
     limbs = " and ".join(f"the {in_words(names[p])} by {abs(measures.angles[p, ROLL]):.0f}"
-                        for p in (limb, int(MIRROR_PART[limb])))
+                         for p in (limb, int(MIRROR_PART[limb])))
     return f"no person's limbs are rolled so, {limbs} degrees; left and right exchanged, of the landmarks or the scan?"
 
 

@@ -102,7 +102,7 @@ def initial_transform(inputs: RegistrationProblem) -> np.ndarray:
         sample, coarse = thin(template.vertices, 0.03 * inputs.size), target.thin(0.03 * inputs.size)
         template_points = FeaturePoints(template.vertices, template.vertex_normals, inputs.descriptors).of(sample)
         index, _ = template_points.match(FeaturePoints(coarse.points, coarse.normals, coarse.descriptors), np.inf,
-                              MatchWeights(positions=0.0, descriptors=1.0, limit=np.inf))
+                                         MatchWeights(positions=0.0, descriptors=1.0, limit=np.inf))
         return landmark_motion(template.vertices[sample[index >= 0]], coarse.points[index[index >= 0]])
     if inputs.landmarks is not None:
         return landmark_motion(template.vertices[inputs.landmarks[0]], inputs.landmarks[1])

@@ -44,7 +44,7 @@ def _near(mesh: Mesh, rows: np.ndarray) -> np.ndarray:
             tree = cKDTree(middle[candidates])
             lists = tree.query_ball_point(middle[rows], reach[rows] + reach[candidates].max())
             pair_lists.append(np.stack([np.repeat(rows, [len(x) for x in lists]),
-                                   candidates[np.concatenate(lists).astype(np.int64)]], axis=1))
+                                        candidates[np.concatenate(lists).astype(np.int64)]], axis=1))
     pairs = np.sort(np.concatenate(pair_lists), axis=1) if pair_lists else np.empty((0, 2), dtype=np.int64)
     pairs = pairs[pairs[:, 0] != pairs[:, 1]]
     pairs = pairs[((low[pairs[:, 0]] <= high[pairs[:, 1]]) & (low[pairs[:, 1]] <= high[pairs[:, 0]])).all(axis=1)]

@@ -48,7 +48,7 @@ def skeleton(poses: Annotated[Path, Place("POSES")], output: Output, template: P
         *(Metric(f"loop of {loop.length} links opened at",
                  f"{' and '.join(loop.parts)}, {'joined' if loop.joined else 'no longer linked'}")
           for loop in search.loops), *_shares(found, body)], {"skeleton": config},
-        judgement=Judgement.of(skeleton_problem(search, config.parts), skeleton_doubts(found)))
+                   judgement=Judgement.of(skeleton_problem(search, config.parts), skeleton_doubts(found)))
 
 
 def edit(skeleton: Annotated[Path, Place("SKELETON")], output: Output, template: Path | None = None,

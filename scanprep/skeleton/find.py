@@ -101,7 +101,7 @@ def search_skeleton(template: Mesh, poses: np.ndarray, config: SkeletonConfig | 
     skeleton, symmetric = finder.skeleton(best, config.parts)
     loops = tuple(_name_loop(loop, skeleton) for loop in best.loops)
     search = SkeletonSearch(skeleton, loops, finder.symmetry, symmetric,
-                           tuple(run.energy for run in finder.runs), tuple(len(run.links) + 1 for run in finder.runs))
+                            tuple(run.energy for run in finder.runs), tuple(len(run.links) + 1 for run in finder.runs))
     if progress is not None:
         progress(config.restarts + 1, config.restarts + 1)
     return search

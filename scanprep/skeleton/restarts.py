@@ -170,7 +170,7 @@ def _improve(search: PartSearch, label: np.ndarray, links: np.ndarray) -> tuple[
             tree = without_weak(search, moved)
             better = _score(search, moved)
             if (len(tree) == moved.max() and better < score - 0.005
-                    and (moved.max() < many or passages(search, moved)[0].max() < FADING)):
+                and (moved.max() < many or passages(search, moved)[0].max() < FADING)):
                 label, links, score = moved, tree, better
                 break
         else:

@@ -195,8 +195,8 @@ def align_cameras(views: ViewsArg, output: Output, landmarks: Path | None = None
         Metric("largest shift of a camera", MM * max(shifts), "mm"),
         Metric("seen by others too, least of a view", 100 * float(found.overlap.min()), "%"),
         Metric("looked through by others, most of a view", 100 * float(found.conflict.max()), "%")],
-        {"views": config}, doubts,
-        judgement=Judgement.of(views_problem(found), doubts))
+                   {"views": config}, doubts,
+                   judgement=Judgement.of(views_problem(found), doubts))
 
 
 def merge(views: ViewsArg, output: Output, unit: Unit | None = None, config: MergeConfig = MergeConfig()) -> Outcome:
@@ -245,12 +245,12 @@ def fill(mesh: MeshArg, output: Output, views: Path | None = None, unit: Unit | 
     write_mesh(output, after)
     loops = len(after.boundary_loops)
     still_open = [f"{number_of(loops, 'hole is', 'holes are')} still open"] if loops else []
+    judgement = filling_judgement(holes, len(after.faces) - len(before.faces)).merge(Judgement.of(check=still_open))
     return Outcome(output, [
         Metric("holes before", len(before.boundary_loops)),
         *(Metric(f"{way} patches", sum(hole.method == way for hole in holes)) for way in ("fair", "diffusion")),
         Metric("triangles that run through others", sum(hole.intersections for hole in holes)),
-        *about_mesh(after)], {"fill": config},
-        judgement=filling_judgement(holes, len(after.faces) - len(before.faces)).merge(Judgement.of(check=still_open)))
+        *about_mesh(after)], {"fill": config}, judgement=judgement)
 
 
 def reduce(mesh: MeshArg, output: Output, faces: Faces, landmarks: Path | None = None, unit: Unit | None = None,

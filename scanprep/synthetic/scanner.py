@@ -143,7 +143,7 @@ def _view(mesh: Mesh, rays: Rays, config: ScannerConfig, number: int, rng: np.ra
 
 
 def _measure(mesh: Mesh, rays: Rays, config: ScannerConfig, camera: np.ndarray, directions: np.ndarray,
-              face: np.ndarray, distance: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+             face: np.ndarray, distance: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     """Compute distances with noise; NaN where a ray missed, grazed, was lost or met a blind region."""
     hit = np.flatnonzero(face >= 0)
     normal = mesh.face_normals[face[hit]]

@@ -134,11 +134,11 @@ def read_betas_to(path: Path, n_betas: int) -> BetasTo:
     keyed = isinstance(tree, dict) and "betas" not in tree
     try:
         keys = {float(s): np.array(betas, dtype=np.float64) for s, betas in
-                 (tree if keyed else {0: tree["betas"] if isinstance(tree, dict) else tree}).items()}
+                (tree if keyed else {0: tree["betas"] if isinstance(tree, dict) else tree}).items()}
     except (TypeError, ValueError, KeyError, OverflowError):
         keys = {}
     if not keys or any(b.ndim not in ((1,) if keyed else (1, 2)) or not b.size or b.shape[-1] > n_betas
-                        or not np.isfinite(b).all() for b in keys.values()):
+                       or not np.isfinite(b).all() for b in keys.values()):
         raise ValueError(f"{path}: expected {wanted}, at most {n_betas} betas each")
     for betas in keys.values():
         BETAS.check(betas, f"{path}: betas")

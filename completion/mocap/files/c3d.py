@@ -221,8 +221,8 @@ def _counts(data: bytes, parameters: _Parameters, numbers: _Numbers, scale: floa
     if not any(counts):
         turned = len(parameters.get(("ROTATION", "LABELS"), ())) or sum(_whole(parameters, "ROTATION", "USED"))
         raise _DamagedError(f"expected points, the C3D file holds rotations of {turned} segments and no markers, as "
-                       "Theia3D writes them; export BVH in its place, for scape animate, or markers" if turned else
-                       f"expected points, the C3D file holds 0 points in {max(last - first + 1, 0)} frames")
+                            "Theia3D writes them; export BVH in its place, for scape animate, or markers" if turned else
+                            f"expected points, the C3D file holds 0 points in {max(last - first + 1, 0)} frames")
     # all combinations that fit into the file
     fitting: list[tuple[int, int, int, int]] = []
     for count, analog, size in itertools.product(filter(None, counts), analogs, sizes):

@@ -101,7 +101,7 @@ def _section(path: Path, data: bytes, begin: int, table: PointTable, labels: lis
     turned = next((-number for number, name, _ in records if number < 0 and name == "ROTATION"), 0)
     kept = [record for number, name, record in records if not (
         number == group and (name in ("USED", "DATA_START") or name.startswith(("LABELS", "DESCRIPTIONS"))))
-        and not (before_rotations and (number, name) == (turned, "DATA_START"))]
+            and not (before_rotations and (number, name) == (turned, "DATA_START"))]
     order = table.numbers.order
     kept.append(_parameter(group, "USED", b"\x02\x00" + struct.pack(f"{order}H", len(labels))))
     most = 255  # largest dimension of a parameter, and number of blocks of all parameters: one byte in the format

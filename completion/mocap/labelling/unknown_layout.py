@@ -315,7 +315,7 @@ def _collect(model: BodyModel, tracks: MarkerSequence, fit: PersonFit, margin: f
         # 25 mm: two tracks this close, which are never seen together, are one marker
         other = next((first for first in groups if np.linalg.norm(
             places[kept.index(first)] - places[row]) < 0.025 and not (seen[:, kept.index(first)] & seen[:, row]).any()),
-            None)
+                     None)
         groups.setdefault(label if other is None else other, []).append(label)
     layout = replace(layout.select(list(groups)), loose=())
     rows = [fit.layout.labels.index(label) for label in layout.labels]

@@ -152,7 +152,7 @@ def transfer_to(layout: LayoutArg, target: Path, output: Output, source: Path | 
         Metric("target not covered", 100 * result.uncovered, "%"),
         Metric("largest distance at a marker", MM * float(result.distances.max()), "mm"),
         Metric("markers without data below them", int((result.confidence < 0.5).sum()))], {"layout": layout},
-        judgement=Judgement.of(check=doubts if result.uncovered > UNCERTAIN else []))
+                   judgement=Judgement.of(check=doubts if result.uncovered > UNCERTAIN else []))
 
 
 def _body(model: Path | None, body: Path | None, unit: Unit | None

@@ -65,9 +65,9 @@ def apply_corrections(layout: MarkerLayout, spots: Spots) -> MarkerLayout:
     moved = {label: spot for label, spot in spots.items() if spot is not None}
     if moved:
         new_places = MarkerLayout(tuple(moved), np.array([spot.corners for spot in moved.values()]),
-                             np.array([spot.distance for spot in moved.values()]),
-                             np.array([spot.weights for spot in moved.values()]),
-                             loose=tuple(label for label, spot in moved.items() if spot.loose))
+                                  np.array([spot.distance for spot in moved.values()]),
+                                  np.array([spot.weights for spot in moved.values()]),
+                                  loose=tuple(label for label, spot in moved.items() if spot.loose))
         kept = kept.merge(new_places) if kept.labels else new_places
     return replace(kept, aliases={a: label for a, label in layout.aliases.items() if label in kept.labels})
 

@@ -94,7 +94,7 @@ class FoundPerson:
         for one in self.recordings:
             labelled = self.folder / one.name / LABELLED
             sequences.append(read_labelled(labelled, one.path, self.unit, self.rate) if labelled.exists()
-                         else read_markers(one.path, self.unit, one.who, self.rate))
+                             else read_markers(one.path, self.unit, one.who, self.rate))
         return sequences
 
     @cached_property
@@ -126,7 +126,7 @@ class FoundPerson:
         for label, moved in self.about["misplaced"].items():
             before, left = (1000 * moved[name] for name in ("from_the_layout", "left"))
             doubts.setdefault(label, []).append(f"worn {before:.0f} mm from where the layout has it; moved there, "
-                                               f"{left:.0f} mm are left")
+                                                f"{left:.0f} mm are left")
         for pair in self.about["exchanged"]:
             for label, other in (pair, pair[::-1]):
                 doubts.setdefault(label, []).append(f"bears the name of {other} throughout; put back")

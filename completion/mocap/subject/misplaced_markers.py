@@ -135,7 +135,7 @@ class MisplacedMarkers:
         if not self.moved:
             return layout
         new_places = MarkerLayout(tuple(m.label for m in self.moved), np.array([m.corners for m in self.moved]),
-                             np.array([m.distance for m in self.moved]), np.array([m.weights for m in self.moved]))
+                                  np.array([m.distance for m in self.moved]), np.array([m.weights for m in self.moved]))
         return replace(layout.without(new_places.labels).merge(new_places), aliases=layout.aliases)
 
 

@@ -46,7 +46,8 @@ def write_control(control: ControlModel, path: str | Path) -> None:
         "axes": np.concatenate(control.axes), "limits": np.concatenate(control.limits),
         "freedom": np.array([len(axes) for axes in control.axes]), "segment_of_part": control.segment_of_part,
         "landmark_vertices": np.array(list(control.landmarks.values()), dtype=np.int64)},
-        {"names": list(skeleton.names), "segments": list(control.segments), "landmarks": list(control.landmarks)})
+                 {"names": list(skeleton.names), "segments": list(control.segments),
+                  "landmarks": list(control.landmarks)})
 
 
 def _load(path: Path) -> ControlModel:

@@ -119,7 +119,7 @@ def find_heights(control: ControlModel, scan: ReadyScan, config: DisplacementCon
     owner = met.normal
     far = met.heights * np.linalg.norm(normals[owner], axis=1)
     met = met.pick((met.cosines > 0.1) & (far >= low[owner]) & (far <= high[owner])
-                       & not_inverted(mesh, texels.faces[owner], texels.bary[owner], met.heights))
+                   & not_inverted(mesh, texels.faces[owner], texels.bary[owner], met.heights))
     several = np.bincount(met.normal, minlength=len(points)) > 1
     heights = _choose(met, several, texels.neighbours())
     known, folded = _sort(control, texels, heights, several)

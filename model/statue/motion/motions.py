@@ -91,7 +91,7 @@ def middle_drift(control: ControlModel, poses: np.ndarray) -> np.ndarray:
     """Compute the shift (T, 3), metres, of the centroid of part 0 from the root's joint in poses (T, J, 3)."""
     ids, share = control.skeleton.joint_weights(control.mesh, 0)
     root_rig = replace(control.rig, mesh=Mesh(control.mesh.vertices[ids], np.zeros((0, 3), dtype=np.int64)),
-                   weights=control.weights[ids], shapes=np.zeros((0, len(ids), 3)))
+                       weights=control.weights[ids], shapes=np.zeros((0, len(ids), 3)))
     return np.asarray(share @ root_rig.vertices(poses) - control.skeleton.joints[0])
 
 
@@ -105,7 +105,7 @@ def people_motion(control: ControlModel, pose: np.ndarray, poses: np.ndarray, tr
     poses, trans = check_motion(skeleton, poses, trans, rate)
     offsets = skeleton.joints - np.where(skeleton.parents[:, None] < 0, 0, skeleton.joints[skeleton.parents])
     moving = MovingSkeleton(skeleton.names, skeleton.parents, offsets, {}, skeleton.part_rotations(poses),
-                       joint_places(skeleton, poses, trans), rate)
+                            joint_places(skeleton, poses, trans), rate)
     return retarget_pair(Pairing(control.skeleton, control.rig.vertices, moving, pose), True, girdle, True)
 
 

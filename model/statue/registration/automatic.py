@@ -60,7 +60,7 @@ def find_features(control: ControlModel, scan: Mesh) -> Features:
         return Features({}, {}, (*control.skeleton.names, *control.landmarks), None, None, problem)
     placed = data.with_vertices(metres * data.vertices) if isinstance(data, Mesh) else metres * data
     result = register(best.mesh, placed, config=RegistrationConfig(graph=RegistrationConfig().graph[-2:]),
-                     start=np.eye(4))
+                      start=np.eye(4))
     joints, points, missing = _features(control, result, placed, metres)
     fit = fit_features(control, joints, points) if len(joints) + len(points) > 2 else None
     registered = control.mesh.with_vertices(result.mesh.vertices / metres)

@@ -61,7 +61,7 @@ def fit_features(control: ControlModel, joints: Mapping[str, np.ndarray],
         return 1e6 * (value + 1e-6 * float(off @ off)), 1e6 * unit * slope
 
     result = minimize(energy, start / unit, jac=True, method="L-BFGS-B", bounds=bounds / unit[:, None],
-                     options={"maxiter": 2000, "maxfun": 4000, "ftol": 1e-9, "gtol": 1e-6, "maxcor": 50})
+                      options={"maxiter": 2000, "maxfun": 4000, "ftol": 1e-9, "gtol": 1e-6, "maxcor": 50})
     x = np.clip(unit * result.x, *bounds.T)
     frames = model.frames(x)
     pose = model.pose(x)
