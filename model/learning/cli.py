@@ -34,6 +34,10 @@ from .scape import judge_model, learn_blendscape, learn_scape
 from .sexes import learn_by_sex
 from .skinning import SkinConfig, learn_skinning
 
+# From 40 poses and 40 people on no prior is needed. With 20 poses the skeleton left 11.4 mm in held-out poses, with a
+# prior 7.6 mm; with 57 poses 6.0 mm, with a prior 6.4 mm.
+ENOUGH = 40
+
 Kind = Literal["scape", "blendscape", "skinning", "mixed"]
 WITH_PRIOR = "scape", "blendscape"
 
@@ -97,11 +101,8 @@ def learn(poses: Path, output: Output, shapes: Path | None = None, template: Pat
     named = read_landmark_vertices(marks, body) if landmarks or marks.exists() else {}
     # a prior where poses or people are few, the skeleton where none is given, and the model
     step = KeptSteps(space)
-    # From 40 poses and 40 people on no prior is needed. With 20 poses the skeleton left 11.4 mm in held-out poses,
-    # with a prior 7.6 mm; with 57 poses 6.0 mm, with a prior 6.4 mm.
-    enough = 40
-    many = len(posed) >= enough
-    if not with_prior or (prior == "auto" and many and people is not None and len(people) >= enough):
+    many = len(posed) >= ENOUGH
+    if not with_prior or (prior == "auto" and many and people is not None and len(people) >= ENOUGH):
         prior = "none"
     known = _bring_prior(body, prior, step)
     # the poses of a prior show joints that few scans do not bend
