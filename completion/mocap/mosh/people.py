@@ -125,13 +125,13 @@ class FoundPerson:
         # what was found of the person: misplaced markers, exchanged names, markers left out
         for label, moved in self.about["misplaced"].items():
             before, left = (1000 * moved[name] for name in ("from_the_layout", "left"))
-            doubts.setdefault(label, []).append(f"worn {before:.0f} mm from where the layout has it; moved there, "
+            doubts.setdefault(label, []).append(f"misplaced by {before:.0f} mm; moved to its real place, "
                                                 f"{left:.0f} mm are left")
         for pair in self.about["exchanged"]:
             for label, other in (pair, pair[::-1]):
-                doubts.setdefault(label, []).append(f"bears the name of {other} throughout; put back")
+                doubts.setdefault(label, []).append(f"name swapped with {other} throughout; corrected")
         for label in self.about["left_out"]:
-            doubts.setdefault(label, []).append("not worn where the layout has it, and found nowhere: left out")
+            doubts.setdefault(label, []).append("misplaced, and no place was found: left out")
         # what was found of each recording: distrusted markers and artefacts
         for one, motion in zip(self.recordings, self.motions, strict=True):
             for label in motion.distrusted:

@@ -47,14 +47,16 @@ def person_page(name: str, model: BodyModel, result: MoshResult, usual: MarkerLa
         add_entry(page, take.name, map(as_line, _main(figures[take.name])))
     # misplaced markers and exchanged names
     if misplaced.changes or misplaced.too_many:
-        page.section("Markers worn elsewhere", "Markers that were far from where the layout has them, sought over the "
-                     "whole body that the others tell.")
-        page.table([*((f"{first} and {second}", "bore each other's name; put back", np.nan, np.nan)
+        page.section("Misplaced markers", "Markers that were far from the layout's place. They were searched on the "
+                     "whole body that the other markers show.")
+        page.table([*((f"{first} and {second}", "names were swapped throughout; corrected", np.nan, np.nan)
                       for first, second in misplaced.exchanged),
-                    *((m.label, "worn elsewhere; moved there", MM * m.before, MM * m.after) for m in misplaced.moved),
+                    *((m.label, "misplaced; moved to its real place", MM * m.before,
+                       MM * m.after) for m in misplaced.moved),
                     *((label, "no place on the skin explains it; left out", np.nan, np.nan)
                       for label in misplaced.unplaced),
-                    *((label, "too many are far off; let be", np.nan, np.nan) for label in misplaced.too_many)],
+                    *((label, "too many are far off; left as they are", np.nan,
+                       np.nan) for label in misplaced.too_many)],
                    ("marker", "what was found", "from the layout's place (mm)", "from the new place (mm)"))
     # a table of markers, the one that moved most first
     left: dict[str, list[np.ndarray]] = {}

@@ -26,7 +26,7 @@ def markers_told(motions: Sequence[Motion]) -> Metric:
 def find_distrusted_markers(motions: Sequence[Motion]) -> tuple[str, ...]:
     """Return a doubt for markers that are distrusted throughout the motions of one body."""
     out = sorted({label for motion in motions for label in motion.distrusted})
-    return (f"{', '.join(out)} hardly ever believed: not worn where the layout says, and not in the mean distance",
+    return (f"{', '.join(out)} distrusted in most frames: misplaced? They are not in the mean distance",
             ) if out else ()
 
 

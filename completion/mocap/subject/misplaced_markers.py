@@ -86,9 +86,10 @@ class MisplacedMarkers:
 
     def metrics(self) -> list[Metric]:
         """Return a row for each difference from the layout."""
-        return [*(Metric("names exchanged throughout, put back", " and ".join(pair)) for pair in self.exchanged),
-                *(Metric(f"worn elsewhere, moved there ({m.label})", 1000 * m.before, "mm") for m in self.moved),
-                *(Metric("far from the layout's place, and found nowhere: left out", label) for label in self.unplaced),
+        return [*(Metric("names swapped throughout, corrected", " and ".join(pair)) for pair in self.exchanged),
+                *(Metric(f"misplaced marker, moved to its real place ({m.label})", 1000 * m.before,
+                         "mm") for m in self.moved),
+                *(Metric("misplaced marker, no place found: left out", label) for label in self.unplaced),
                 *(Metric("far from the layout's place, as are too many others", label) for label in self.too_many),
                 *(Metric(f"{'all' if whole else 'most'} markers of the {part} far from the layout's places",
                          ", ".join(labels)) for part, labels, whole in self.lost)]
@@ -108,7 +109,7 @@ class MisplacedMarkers:
                        for share, wanted in (("all", True), ("most", False)))
         check += some
         if self.unplaced:
-            check.append(f"{', '.join(self.unplaced)} not worn where the layout says, and found nowhere: left out")
+            check.append(f"{', '.join(self.unplaced)} misplaced, and no place was found: left out")
         if self.too_many:
             check.append(f"{', '.join(self.too_many)} far from where the layout says: the wrong layout, or the wrong "
                          "body?")
