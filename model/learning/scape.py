@@ -172,11 +172,10 @@ def learn_blendscape(template: Mesh, poses: np.ndarray, shapes: np.ndarray | Non
     --------
     >>> from model import load_built_in_model
     >>> known = load_built_in_model()
-    >>> try:
-    ...     learn_blendscape(known.template, known.template.vertices[None], None, known.skeleton)
-    ... except ValueError as error:
-    ...     print(error)
-    poses: expected at least 2 bodies, got 1
+    >>> poses = known.subject(None).vertices(known.pose_examples[:4])
+    >>> quick = LearnConfig(refinements=0, prunings=(0.01,), ridges=(0.01,))
+    >>> learn_blendscape(known.template, poses, None, known.skeleton, quick).kind
+    'blendscape'
 
     [BlendSCAPE]
     """

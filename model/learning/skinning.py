@@ -96,11 +96,9 @@ def learn_skinning(template: Mesh, poses: np.ndarray, shapes: np.ndarray | None,
     --------
     >>> from model import load_built_in_model
     >>> known = load_built_in_model()
-    >>> try:
-    ...     learn_skinning(known.template, known.template.vertices[None], None, known.skeleton)
-    ... except ValueError as error:
-    ...     print(error)
-    poses: expected at least 2 bodies, got 1
+    >>> poses = known.subject(None).vertices(known.pose_examples[:3])
+    >>> learn_skinning(known.template, poses, None, known.skeleton, SkinConfig(rounds=1, correctives=False)).kind
+    'skinning'
 
     Loper et al., SMPL, 2015.
     """
