@@ -37,7 +37,8 @@ def commands(listed=COMMANDS, prog="scape"):
 def all_settings():
     for package in (scanprep, model, completion):
         for module in pkgutil.walk_packages(package.__path__, package.__name__ + "."):
-            if not module.name.endswith("__main__"):
+            # PyTorch is optional, and its room has no settings
+            if not module.name.endswith("__main__") and module.name != "model.torch":
                 importlib.import_module(module.name)
 
     def below(cls):
