@@ -104,7 +104,8 @@ def main() -> None:
         cases += [(path, args.model) for path in sorted(args.folder.glob("*.c3d") if args.folder else ())
                   if not args.files or path.stem in args.files]
         for file, model in cases:
-            rows.append(measured(file.resolve(), model.resolve(), args.layout, args.tree.resolve()))
+            model = model if str(model) == BUILT_IN else model.resolve()         # a name, or a file
+            rows.append(measured(file.resolve(), model, args.layout, args.tree.resolve()))
             print("  ".join(f"{name} {value if isinstance(value, str | dict) else format(value, '.4g')}"
                             for name, value in rows[-1].items()), flush=True)
     write_report(args.output, {"protocol": f"scape mosh, the whole command, {args.layout}", "machine": machine(),
