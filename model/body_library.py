@@ -41,7 +41,7 @@ PARTS = {"shoulder": "upper_arm", "elbow": "forearm", "wrist": "hand", "hip": "t
 
 LONGER = 0.04                        # length that one beta adds to a bone: 4%, about the spread of statures
 BENT, POSES = 0.5, 32                # radians (standard deviation) and number of poses that each joint is learned from
-LEFT_OUT, TESTS = 0.3, 60            # the same for the error: all joints bend together, so each of them bends less
+LEFT_OUT, TESTS = 0.3, 60            # radians and number of poses for the error: all joints bend, each of them less
 AT_ONCE = 8                          # bodies that the library makes together: 18,000 vertices with a matrix each
 ROUNDING = 1e-6                      # metres: a smaller change counts as none
 BONES, NOTHING = -2, -1              # stand for a joint where a control changes bone lengths, or nothing

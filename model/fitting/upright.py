@@ -13,7 +13,7 @@ from scanprep.skeleton.tree import Skeleton
 TILT = 0.35                          # radians: how far trunks of standing people lean, standard deviation
 PICTURE = np.array([[0, -1.0, 0], [0, 1.0, 0], [1.0, 0, 0], [-1.0, 0, 0]])    # a camera as it is, upside down, rolled
 SPREAD = 3000                        # rotations, 15 degrees apart, of which the upright ones are tried
-SPREAD_OF_MANY = 1500                # the same where up is one of several directions, so that the time stays alike
+SPREAD_OF_MANY = 1500                # rotations where up is one of several directions, so that the time stays alike
 
 
 @dataclass(frozen=True, eq=False)

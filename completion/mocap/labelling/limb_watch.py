@@ -8,7 +8,6 @@ from .follow_points import OWN_PERSON
 from .live_matching import find_unmatched
 
 WINDOW, LONG = 0.1, 2.0              # seconds: time constants of the strain, and of the usual strain
-# strain above the usual, in markers, at which a limb is searched; a reversed foot had 1.3 to 1.9, a right one below 0.8
 PATIENCE, LONGEST = 0.25, 4.0        # seconds from a search without success to the next, doubled up to LONGEST
 
 
@@ -20,6 +19,7 @@ class LimbWatch:
     search : BodySearch
     """
 
+    # strain above the usual, in markers, at which a limb is searched: a reversed foot had 1.3 to 1.9, a right one less
     WORSE = 0.8
     POSES = 8                            # poses tried for a limb, half of them only below its second joint
 
