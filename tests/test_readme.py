@@ -45,7 +45,7 @@ def there(place):
 def test_set_up_is_what_ci_does():
     assert SET_UP <= set(commands(README))
     ci = (ROOT / ".ci" / "run").read_text()
-    assert 'pip install --quiet ".[test]"' in ci and "\npytest\n" in ci
+    assert 'pip install --quiet ".[test]"' in ci and '\npytest -m "slow or not slow"\n' in ci
 
 
 def test_commands(place):
