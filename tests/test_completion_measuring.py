@@ -85,6 +85,18 @@ def test_a_model_with_the_ten_landmarks_of_the_readme_is_measured(folder, tmp_pa
         assert float(ten[name]) == pytest.approx(float(full[name]), abs=0.012), name
 
 
+def test_a_set_made_without_landmarks_is_measured(tmp_path):
+    """Its landmark file is empty: all are looked for, and on the built-in people they are known."""
+    person = SyntheticPerson().mesh
+    RegisteredSet.create(tmp_path / "set", person).add("anna", person)
+    (tmp_path / "set" / "landmarks.json").write_text("{}")
+    (tmp_path / "none.json").write_text("{}")
+    for name, words in (("set", ()), ("file", ("--landmarks", tmp_path / "none.json"))):
+        assert scape(tmp_path / "set", *words, "-o", tmp_path / f"{name}.csv") == 0
+        assert float(table(tmp_path / f"{name}.csv")["anna"]["stature"]) == pytest.approx(
+            np.ptp(person.vertices[:, 2]), abs=0.005)
+
+
 def test_what_is_no_person_has_no_landmarks_to_measure_from(tmp_path, capsys):
     ball = trimesh.creation.icosphere(4, 0.5)
     write_mesh(tmp_path / "ball.ply", Mesh(ball.vertices, ball.faces))

@@ -5,12 +5,14 @@ import numpy as np
 import pytest
 
 from scanprep.decimation.decimate import decimate
-from scanprep.geometry.files import MeshFileError
+from scanprep.geometry.files import MeshFileError, write_mesh
 from scanprep.geometry.landmark_names import TEN, landmark_name, pair_names, translate_landmarks
 from scanprep.geometry.landmarks import (
     LANDMARK_ENDINGS,
+    known_template_landmarks,
     landmarks_beside,
     match_landmarks,
+    names_no_landmark,
     read_landmark_vertices,
     read_landmarks,
     read_template_landmarks,
@@ -150,8 +152,8 @@ def test_every_format_comes_back(tmp_path, ending):
 
 
 @pytest.mark.parametrize("ending", WRITTEN)
-@pytest.mark.parametrize("data", [b"", b"\n\n", bytes(range(256)) * 4, b"\x00\x01\x02"])
-def test_what_holds_no_landmarks_is_one_line(tmp_path, ending, data):
+@pytest.mark.parametrize("data", [b"", bytes(range(256)) * 4, b"\x00\x01\x02"])
+def test_what_cannot_hold_landmarks_is_one_line(tmp_path, ending, data):
     (tmp_path / f"a{ending}").write_bytes(data)
     with pytest.raises(MeshFileError, match=rf"a\{ending}") as told:
         read_landmarks(tmp_path / f"a{ending}", MESH)
@@ -199,7 +201,6 @@ def test_what_is_written_comes_back(tmp_path):
 @pytest.mark.parametrize(("name", "content", "words"), [
     ("a.json", "{not json", ["expected landmarks in JSON"]),
     ("a.json", [1, 2, 3], ["list"]),
-    ("a.json", {}, ["found none"]),
     ("a.json", {"nose": [0, 1]}, ["'nose'", "[0, 1]"]),
     ("a.json", {"nose": "there"}, ["'nose'", "there"]),
     ("a.json", {"nose": True}, ["'nose'"]),
@@ -214,7 +215,6 @@ def test_what_is_written_comes_back(tmp_path):
     ("a.pp", "<PickedPoints><point x='1'", ["MeshLab"]),
     ("a.pp", "<PickedPoints><point x='1' y='2' name='a'/></PickedPoints>", ["MeshLab", "z"]),
     ("a.lnd", "AUX =\n1 0 1 24.03 14.73 18.98 Sellion\nEND =\n", ["line 2", "Sellion"]),
-    ("a.lnd", "AUX =\nEND =\n", ["found none"]),
     ("a.txt", "0 0 1 nose\n0 0 1\n", ["line 2", "x y z name"]),
     ("a.txt", "0 0 1 nose\n0 zero 1 chin\n", ["line 2", "zero"]),
     ("a.txt", "0 0 1 nose\n0 0 2 nose\n", ["'nose' comes twice"]),
@@ -224,7 +224,6 @@ def test_what_is_written_comes_back(tmp_path):
     ("a.csv", "nose,0,0,1\n", ["line 1", "heading with name, x, y, z"]),
     ("a.csv", "name,x,y,z\nnose,0,0,1\nchin,0,zero,1\n", ["line 3", "zero"]),
     ("a.csv", "name,x,y,z\nnose,0,0,nan\n", ["line 2", "nan"]),
-    ("a.csv", "name,x,y,z\n", ["found none"]),
     ("a.scalismo.json", [{"id": "nose", "coordinates": [1, 2]}], ["'nose'", "[1, 2]"]),
     ("a.scalismo.json", [{"id": "nose"}], ["'nose'"]),
     ("a.json", '[{"id": "nose", "coordinates": [0, 1, NaN]}]', ["'nose'", "not finite"]),
@@ -233,7 +232,6 @@ def test_what_is_written_comes_back(tmp_path):
     ("a.xml", marker_set(POINTS).replace("torso", "pelvis", 1), ["'nose' on pelvis", "'left knee' on torso", "TRC"]),
     ("a.xml", marker_set(POINTS, ""), ["OpenSim", "marker 1 'nose'", "socket_parent_frame"]),
     ("a.xml", marker_set(POINTS).replace("-0.2", "far"), ["OpenSim", "marker 1 'nose'", "location"]),
-    ("a.xml", "<OpenSimDocument/>", ["found none"]),
 ])
 @pytest.mark.parametrize("read", [read_landmarks, read_landmark_vertices])
 def test_bad_files_say_what_is_wrong(tmp_path, read, name, content, words):
@@ -243,6 +241,25 @@ def test_bad_files_say_what_is_wrong(tmp_path, read, name, content, words):
     message = str(caught.value)
     assert str(path) in message and "\n" not in message
     assert all(word in message for word in words), message
+
+
+@pytest.mark.parametrize(("name", "content"), [
+    ("a.json", {}), ("a.json", []), ("a.mrk.json", {"markups": []}), ("a.pp", "<PickedPoints/>"),
+    ("a.lnd", "AUX =\nEND =\n"), ("a.fcsv", fiducials({}, "LPS")), ("a.csv", "name,x,y,z\n"), ("a.txt", "# none\n"),
+    ("a.xml", "<OpenSimDocument/>")])
+def test_a_file_may_say_that_no_landmark_is_known(tmp_path, name, content):
+    """As in the set of scans without landmarks: its readers go on as if there were no file."""
+    path = written(tmp_path / name, content)
+    assert names_no_landmark(path) and read_landmarks(path) == {} == read_landmark_vertices(path, MESH)
+    assert try_match_landmarks(path, {"navel": 1}, read_landmarks(path)) is None            # without a warning
+    write_mesh(tmp_path / "a.ply", MESH)
+    assert known_template_landmarks(tmp_path / "a.ply", MESH, path) == {}
+    with pytest.raises(ValueError, match=r"a\.ply: expected its landmarks in a\.landmarks\.json"):
+        read_template_landmarks(tmp_path / "a.ply", MESH, path)
+
+
+def test_a_damaged_file_is_not_one_without_landmarks(tmp_path):
+    assert not names_no_landmark(written(tmp_path / "a.json", "{not json"))
 
 
 def test_a_missing_file(tmp_path):

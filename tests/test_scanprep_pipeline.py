@@ -49,6 +49,12 @@ def test_scans_and_what_is_known_of_them(scans):
     assert [t.name for t in find_scans(scans)] == ["body0", "body1", "body2", "cloud"]
 
 
+def test_a_landmark_file_without_landmarks_is_as_none(scans):
+    (scans / "body0.landmarks.json").write_text("{}")
+    (scans / "body1.landmarks.json").write_text("{")                      # damaged: registering the scan reports it
+    assert [t.landmarks is None for t in find_scans(scans)] == [True, False, False]
+
+
 def test_dots_belong_to_the_names_of_scans(scans, tmp_path):
     for file in ("2024.05.01 anna", "2024.05.02 anna"):
         shutil.copy(scans / "body0.ply", tmp_path / f"{file}.ply")

@@ -145,7 +145,7 @@ def landmarks_of(file: Path | None, bodies: Sequence[Body], model: BodyModel | N
         known = dict(model.info["landmarks"])
     elif beside is not None:
         known = read_landmark_vertices(beside, template)
-    elif np.array_equal(template.faces, load_topology().mesh.faces):
+    if not known and np.array_equal(template.faces, load_topology().mesh.faces):
         known = landmarks()
 
     # further landmarks that tapes need

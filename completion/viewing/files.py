@@ -181,9 +181,9 @@ class Files:
             content = last.load()
             mesh = getattr(content.shapes[0], "mesh", None)
             places = layout_places(path, mesh) or read_landmarks(path, mesh, self.unit)
-            dots = mark_places(places, content.stance, path.name)
+            dots = [mark_places(places, content.stance, path.name)] if places else []
             still = (f"{path.name}: shown on the body at rest, without sliders",) * (content.model is not None)
-            return replace(content, shapes=[*content.shapes, dots], model=None, notes=(*content.notes, *still))
+            return replace(content, shapes=[*content.shapes, *dots], model=None, notes=(*content.notes, *still))
 
         entries.append(replace(last, load=load))
 

@@ -54,7 +54,7 @@ def entries_of(path: Path, data: bytes, unit: str | None) -> LandmarkFile:
 def _json(path: Path, data: bytes, unit: str | None) -> LandmarkFile:
     """Read JSON: our format, scalismo's, or a markups file of 3D Slicer."""
     tree = storage.parse_json(path, data, "landmarks", MeshFileError, nan=True)      # refused later, by name
-    if isinstance(tree, list) and tree and all(isinstance(one, dict) and "id" in one for one in tree):
+    if isinstance(tree, list) and all(isinstance(one, dict) and "id" in one for one in tree):
         return LandmarkFile([(str(one["id"]), _point(path, str(one["id"]), one.get("coordinates"))) for one in tree])
     if not isinstance(tree, dict):
         raise MeshFileError(f"{path}: expected landmarks in JSON {{name: [x, y, z]}}, found a {type(tree).__name__}")

@@ -44,8 +44,8 @@ def read_landmarks(path: str | Path, mesh: Mesh | np.ndarray | None = None, unit
     Returns
     -------
     dict of str to (3,) float, metres
-        In the order of the file. Points of 3D Slicer are in its LPS frame, in which it reads and writes meshes, unless
-        the mesh shows that they are in RAS.
+        In the order of the file; empty for a file without landmarks. Points of 3D Slicer are in its LPS frame, in
+        which it reads and writes meshes, unless the mesh shows that they are in RAS.
 
     Raises
     ------
@@ -121,14 +121,28 @@ def landmarks_beside(path: str | Path, folder: Path | None = None) -> Path | Non
     return next((folder / name for name in names if (folder / name).is_file()), None)
 
 
+def names_no_landmark(path: Path) -> bool:
+    """Return whether a landmark file holds no landmark; false for a damaged one, which its reader reports."""
+    try:
+        return not entries_of(path, load_bytes(path), None).pairs
+    except MeshFileError:
+        return False
+
+
+def known_template_landmarks(template: Path, mesh: Mesh, given: Path | None = None) -> dict[str, int]:
+    """Read named vertices of a template from a given file, or from the one beside it; empty where none are known."""
+    path = given or landmarks_beside(template)
+    return {} if path is None else read_landmark_vertices(path, mesh)
+
+
 def read_template_landmarks(template: Path, mesh: Mesh, given: Path | None = None, flag: str = "--template-landmarks"
                             ) -> dict[str, int]:
-    """Read named vertices of a template from a given file, or from the one beside it."""
-    path = given or landmarks_beside(template)
-    if path is None:
+    """Read named vertices of a template as `known_template_landmarks`; ValueError where none are known."""
+    known = known_template_landmarks(template, mesh, given)
+    if not known:
         raise ValueError(f"{template}: expected its landmarks in {name_of(template)}.landmarks.json beside "
                          f"it; name the file with {flag}")
-    return read_landmark_vertices(path, mesh)
+    return known
 
 
 def check_on_surface(path: str | Path, landmarks: Mapping[str, np.ndarray], surface: np.ndarray) -> None:
@@ -239,8 +253,11 @@ def try_match_landmarks(path: Path, template_landmarks: Mapping[str, int], scan_
                         ) -> tuple[np.ndarray, np.ndarray] | None:
     """Match landmarks: vertices (L,) and points (L, 3); None, with a warning, if too few match.
 
-    `path` is the scan's landmark file, for the warning, which lists the names of both sides.
+    `path` is the scan's landmark file, for the warning, which lists the names of both sides. A scan without landmarks
+    needs no warning.
     """
+    if not scan_landmarks:
+        return None
     try:
         return match_landmarks(template_landmarks, scan_landmarks)[1:]
     except ValueError as problem:
@@ -251,8 +268,6 @@ def try_match_landmarks(path: Path, template_landmarks: Mapping[str, int], scan_
 def _entries(path: Path, mesh: Mesh | np.ndarray | None, unit: str | None) -> dict[str, Entry]:
     """Read and check the entries of a file, with points in metres."""
     pairs, own_unit, flipped = entries_of(path, load_bytes(path), unit)
-    if not pairs:
-        raise MeshFileError(f"{path}: expected landmarks, found none")
     entries = dict(pairs)
     if len(entries) < len(pairs):
         twice = Counter(name for name, _ in pairs).most_common(1)[0][0]

@@ -7,7 +7,7 @@ from pathlib import Path
 from ..console import visible
 from ..geometry import storage, tables
 from ..geometry.files import SCAN_ENDINGS, MeshFileError, is_scan, list_files, name_of
-from ..geometry.landmarks import landmarks_beside
+from ..geometry.landmarks import landmarks_beside, names_no_landmark
 
 TABLE = "scans.csv"               # optional table beside the scans
 ABOUT = {"digest": False}         # fields that only go into tables, so changing them registers nothing again
@@ -65,8 +65,8 @@ def find_scans(folder: str | Path, landmarks: str | Path | None = None, subject:
     tasks = []
     for name, path in sorted(paths.items()):
         row = about.get(name, {})
-        beside = (landmarks_beside(path, place) for place in places)
-        tasks.append(ScanTask(name, path, next(filter(None, beside), None),
+        beside = next(filter(None, (landmarks_beside(path, place) for place in places)), None)
+        tasks.append(ScanTask(name, path, None if beside is None or names_no_landmark(beside) else beside,
                               row.get("subject") or subject or name, row.get("pose") or "", row.get("sex") or ""))
     return tasks
 

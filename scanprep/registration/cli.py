@@ -86,7 +86,8 @@ def _read_landmarks(template: Path, body: Mesh, scan: Path, data: Mesh | np.ndar
     if file is None:
         return None, [Metric("landmarks", 0)]
     known = read_landmarks(file, data, unit)
-    pairs = try_match_landmarks(file, read_template_landmarks(template, body, template_landmarks), known)
+    pairs = try_match_landmarks(file, read_template_landmarks(template, body, template_landmarks), known
+                                ) if known else None
     return pairs, [Metric("landmarks", len(pairs[0]) if pairs else 0), Metric("landmark file", file.name)]
 
 

@@ -146,8 +146,8 @@ def clean(scan: ScanArg, output: Output, landmarks: Path | None = None, unit: Un
     """
     raw = read_scan(scan, unit)
     mesh = raw if isinstance(raw, Mesh) else None
-    marks = np.array(list(read_landmarks(landmarks, mesh, unit).values())) if landmarks else None
-    found = clean_scan(raw, config, marks)
+    places = read_landmarks(landmarks, mesh, unit) if landmarks else {}
+    found = clean_scan(raw, config, np.array(list(places.values())) if places else None)
     if isinstance(found.scan, Mesh):
         write_mesh(output, found.scan)
     else:
@@ -282,8 +282,8 @@ def reduce(mesh: MeshArg, output: Output, faces: Faces, landmarks: Path | None =
             *about_mesh(done.template)], {"decimate": of_set}, judgement=_as_template(done.template))
     given = read_scan_mesh(mesh, unit)
     before, keep = _manifold(given, mesh), None
-    if landmarks:
-        places = {name: given.vertices[v] for name, v in read_landmark_vertices(landmarks, given, unit).items()}
+    if landmarks and (named := read_landmark_vertices(landmarks, given, unit)):
+        places = {name: given.vertices[v] for name, v in named.items()}
         keep = np.array(list(carry_landmarks(places, before)[0].values()))
     with bar("decimating") as progress:
         after = decimate(before, faces, config, keep, progress=progress)

@@ -169,7 +169,10 @@ def read_layout(given: str | Path, template: Mesh, kept: np.ndarray | None = Non
             isinstance(place, list | int) or (isinstance(place, dict) and "face" in place) for place in tree.values())
     if not clicked:
         return MarkerLayout.load(named, len(template.vertices))
-    layout, distances = layout_on(template, read_landmarks(named, template))
+    places = read_landmarks(named, template)
+    if not places:
+        raise MarkerFileError(f"{named}: expected markers in the layout, found none")
+    layout, distances = layout_on(template, places)
     far = distances.argmax()
     if distances[far] > 0.015 * size(template):                        # clicks are at most 1.5% of the size off
         raise MarkerFileError(f"{named}: expected places on the model's template, '{layout.labels[far]}' is "
