@@ -9,7 +9,7 @@ from scanprep.geometry.files import MeshFileError, write_mesh
 from scanprep.geometry.landmark_names import TEN, landmark_name, pair_names, translate_landmarks
 from scanprep.geometry.landmarks import (
     LANDMARK_ENDINGS,
-    known_template_landmarks,
+    find_template_landmarks,
     landmarks_beside,
     match_landmarks,
     names_no_landmark,
@@ -253,7 +253,7 @@ def test_a_file_may_say_that_no_landmark_is_known(tmp_path, name, content):
     assert names_no_landmark(path) and read_landmarks(path) == {} == read_landmark_vertices(path, MESH)
     assert try_match_landmarks(path, {"navel": 1}, read_landmarks(path)) is None            # without a warning
     write_mesh(tmp_path / "a.ply", MESH)
-    assert known_template_landmarks(tmp_path / "a.ply", MESH, path) == {}
+    assert find_template_landmarks(tmp_path / "a.ply", MESH, path) == {}
     with pytest.raises(ValueError, match=r"a\.ply: expected its landmarks in a\.landmarks\.json"):
         read_template_landmarks(tmp_path / "a.ply", MESH, path)
 

@@ -9,7 +9,7 @@ from scan_folders import MARKS, WITH_PICTURES, ball, write_scans
 from scene_reader import scenes_of
 from scipy.spatial.transform import Rotation
 
-from scanprep import RegisteredSet, write_landmarks, write_mesh
+from scanprep import RegisteredSet, Skeleton, write_landmarks, write_mesh
 from scanprep.geometry.files import PointCloud, write_points
 from scanprep.judgement import Judgement
 from scanprep.pipeline import page as pictures
@@ -175,6 +175,12 @@ def test_scans_from_one_side_are_not_blamed_for_it():
     said = "60% of a body has no data in these scans: what is there is a guess"
     assert judge_whole(verdicts, None).reasons == (said,)
     assert judge_whole(review([replace(f, seen=0.8) for f in front], {}, 1.4, 25_000), None).verdict == "good"
+
+
+def test_another_number_of_parts_than_wanted_needs_a_look():
+    verdicts, tree = review([GOOD], {}, 1.4, 25_000), Skeleton([0, 1], [-1, 0], np.zeros((2, 3)))
+    assert judge_whole(verdicts, tree, parts=2).verdict == "good"
+    assert "no skeleton of 16 parts was found, the nearest has 2" in judge_whole(verdicts, tree, parts=16).why
 
 
 def test_stretches_of_a_known_map(template):

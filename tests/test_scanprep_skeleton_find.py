@@ -9,6 +9,7 @@ import pytest
 from scanprep.geometry import rotations
 from scanprep.geometry.mesh import Mesh, check_template
 from scanprep.skeleton.find import find_skeleton
+from scanprep.skeleton.names import skeleton_doubts
 from scanprep.skeleton.parts import SkeletonConfig
 from scanprep.skeleton.tree import Skeleton
 
@@ -144,9 +145,13 @@ def test_an_exact_number_of_parts_is_kept(figure: Figure, poses: np.ndarray, cou
     assert len(skeleton.parents) == count
 
 
-def test_more_parts_than_can_be_told_apart_are_refused(figure: Figure, poses: np.ndarray) -> None:
-    with pytest.raises(ValueError, match="parts: no tree of 200 parts"):
-        find_skeleton(figure.template, poses, replace(FEW, parts=200))
+def test_more_parts_than_can_be_told_apart_give_the_nearest_tree_and_a_reason(figure: Figure, poses: np.ndarray
+                                                                              ) -> None:
+    skeleton = find_skeleton(figure.template, poses, replace(FEW, parts=200))
+    assert len(BOXES) <= len(skeleton.parents) < 200
+    doubt, *_ = skeleton_doubts(skeleton, 200)
+    assert f"of 200 parts was found, the nearest has {len(skeleton.parents)}" in doubt and "--parts" in doubt
+    assert not any("parts was found" in doubt for doubt in skeleton_doubts(skeleton, len(skeleton.parents)))
 
 
 def test_moving_the_bodies_and_the_template_changes_nothing_but_the_place(

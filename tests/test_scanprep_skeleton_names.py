@@ -6,7 +6,7 @@ from animal_bodies import Animal, Build
 from scanprep.geometry import rotations
 from scanprep.geometry.mesh import Mesh
 from scanprep.skeleton.edit import merge_parts, split_part
-from scanprep.skeleton.names import name_parts
+from scanprep.skeleton.names import name_parts, note_numbered_parts
 from scanprep.skeleton.roles import find_roles, in_words, joint_in_words, limb_parts, missing_joints, part_name
 from scanprep.skeleton.symmetry import find_symmetry
 from scanprep.skeleton.tree import Skeleton
@@ -54,6 +54,33 @@ def test_the_order_of_vertices_and_parts_does_not_matter(person):
     mesh = Mesh(person.mesh.vertices[old], np.argsort(old)[person.mesh.faces[faces]])
     found = named(mesh, Skeleton(person.part_of_face[faces], person.parents, person.joints))
     assert found == person.names
+
+
+def test_the_limbs_of_a_pair_are_on_two_sides_of_a_body_that_leans(person):
+    """Both legs were to the left of the middle of the hips, both became left, and learning ended there."""
+    leaning, joints = (points + np.outer(np.maximum(0, 1 - points[:, 2]), [0.6, 0, 0])
+                       for points in (person.mesh.vertices, person.joints))
+    mesh, skeleton = Mesh(leaning, person.mesh.faces), Skeleton(person.part_of_face, person.parents, joints)
+    assert name_parts(mesh, skeleton, find_symmetry(person.mesh)) == person.names
+
+
+def test_the_limbs_of_a_pair_have_the_same_segments(person):
+    """An upper arm just short enough for a shoulder on one side alone gave the arms different names."""
+    joints = person.joints.copy()
+    elbow, shoulder = (person.names.index(f"{part}_left") for part in ("forearm", "upper_arm"))
+    wrist = person.joints[person.names.index("hand_left")]
+    for share in np.linspace(0.2, 0.5, 7):
+        joints[elbow] = joints[shoulder] + share * (wrist - joints[shoulder])
+        names = set(name_parts(person.mesh, Skeleton(person.part_of_face, person.parents, joints),
+                               find_symmetry(person.mesh)))
+        assert {name.removesuffix("_left") for name in names if name.endswith("_left")} == {
+            name.removesuffix("_right") for name in names if name.endswith("_right")}
+
+
+def test_parts_without_names_are_numbered_and_told(person):
+    with pytest.warns(UserWarning, match="the parts are numbered.*edit-skeleton --rename"):
+        note_numbered_parts(unnamed(person.skeleton))
+    note_numbered_parts(person.skeleton)
 
 
 def test_coarser_and_finer_trees_are_named(person):

@@ -7,6 +7,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Literal
 
+import numpy as np
+
 from scanprep.arguments import UsageError
 from scanprep.batch.opening import FileWorkspace
 from scanprep.batch.room import Step, substeps
@@ -19,6 +21,7 @@ from scanprep.geometry.landmarks import read_landmark_vertices
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.tables import read_table
 from scanprep.registration.person import has_limbs
+from scanprep.skeleton.names import note_numbered_parts
 from scanprep.skeleton.roles import joint_in_words
 from scanprep.skeleton.tree import Skeleton
 
@@ -111,9 +114,7 @@ def learn(poses: Path, output: Output, shapes: Path | None = None, template: Pat
     if tree is None:
         if kind == "mixed":
             raise ValueError(f"{poses}: a mix of people shows no skeleton; name one with --skeleton")
-        with bar("finding the skeleton") as progress:
-            tree = step("skeleton", (body, posed, shown),
-                        lambda: choose_skeleton(body, posed, progress, substeps(step, "skeleton"), shown).skeleton)
+        tree = _find_skeleton(body, posed, shown, step)
     with bar("learning the model") as progress:
         how = progress, step
         models: Mapping[str, BodyModel] = (
@@ -144,6 +145,15 @@ def _about_steps(step: KeptSteps) -> list[Metric]:
     return [*(Metric(f"time: {name}", "done before") for name in step.found if "/" not in name),
             *(Metric(f"time: {name}", value, "s, of what was left" if name in begun else "s")
               for name, value in step.seconds.items() if "/" not in name)]
+
+
+def _find_skeleton(body: Mesh, poses: np.ndarray, shown: np.ndarray | None, step: Step) -> Skeleton:
+    """Find the skeleton in poses (M, N, 3), and in those of a prior; note parts without names."""
+    with bar("finding the skeleton") as progress:
+        tree = step("skeleton", (body, poses, shown),
+                    lambda: choose_skeleton(body, poses, progress, substeps(step, "skeleton"), shown).skeleton)
+    note_numbered_parts(tree)
+    return tree
 
 
 def _bring_prior(body: Mesh, prior: str, step: Step) -> TemplatePrior | None:

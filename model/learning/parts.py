@@ -107,6 +107,8 @@ def _try_parts(finder: SkeletonFinder, parts: int | None, coarse: Mesh, poses: n
     """
     try:
         skeleton = finder.skeleton(finder.runs[0] if parts is None else finder.first, parts)[0]
+        if parts not in (None, len(skeleton.parents)):
+            return None
         return skeleton, _leave_out_error(poses, coarse_skeleton(skeleton, finder.template, coarse), coarse, known)
     except ValueError:
         if parts is None:

@@ -129,7 +129,7 @@ def names_no_landmark(path: Path) -> bool:
         return False
 
 
-def known_template_landmarks(template: Path, mesh: Mesh, given: Path | None = None) -> dict[str, int]:
+def find_template_landmarks(template: Path, mesh: Mesh, given: Path | None = None) -> dict[str, int]:
     """Read named vertices of a template from a given file, or from the one beside it; empty where none are known."""
     path = given or landmarks_beside(template)
     return {} if path is None else read_landmark_vertices(path, mesh)
@@ -137,8 +137,8 @@ def known_template_landmarks(template: Path, mesh: Mesh, given: Path | None = No
 
 def read_template_landmarks(template: Path, mesh: Mesh, given: Path | None = None, flag: str = "--template-landmarks"
                             ) -> dict[str, int]:
-    """Read named vertices of a template as `known_template_landmarks`; ValueError where none are known."""
-    known = known_template_landmarks(template, mesh, given)
+    """Read named vertices of a template as `find_template_landmarks`; ValueError where none are known."""
+    known = find_template_landmarks(template, mesh, given)
     if not known:
         raise ValueError(f"{template}: expected its landmarks in {name_of(template)}.landmarks.json beside "
                          f"it; name the file with {flag}")

@@ -8,7 +8,7 @@ from typing import ClassVar
 
 from ..batch.calls import KeptCall
 from ..geometry.files import read_mesh
-from ..geometry.landmarks import known_template_landmarks, read_template_landmarks
+from ..geometry.landmarks import find_template_landmarks, read_template_landmarks
 from ..geometry.mesh import Mesh
 from .prepare import PrepareConfig
 from .scans import ScanTask, find_scans
@@ -37,7 +37,7 @@ class Call(KeptCall):
         template, tasks, through = read_mesh(self.template), self.tasks(), self.config.scan.through
         without = [task.name for task in tasks if task.landmarks is None]
         # the set keeps the template's landmarks even if no scan has any: models learned from it measure bodies by them
-        landmarks = known_template_landmarks(self.template, template, self.template_landmarks)
+        landmarks = find_template_landmarks(self.template, template, self.template_landmarks)
         if through == "pose":
             say("note: no landmarks are used; all scans must be near the template's pose")
         elif len(without) == len(tasks):

@@ -18,6 +18,7 @@ from ..console import Metric, Outcome, bar, say
 from ..dataset import RegisteredSet
 from ..geometry.mesh import Mesh
 from ..registration.figures import Limits, Verdict
+from ..skeleton.names import note_numbered_parts
 from .again import LISTED, Call
 from .page import PAGE, judge_set, judge_whole, write_set_page
 from .prepare import PrepareConfig, Prepared, Progress, prepare
@@ -74,6 +75,10 @@ def carry_out(call: Call, inputs: tuple[list[ScanTask], Mesh, dict[str, int]], s
 def summarize(call: Call, count: int, prepared: Prepared, space: Workspace) -> Outcome:
     """Build the outcome of the command: figures of the set, failures, judgement and next step."""
     verdicts, tree = judge_set(space.folder), prepared.registered.skeleton
+    # a skeleton that was edited is as its user wants it
+    parts = call.config.skeleton.parts if space.is_ours("skeleton.json") else None
+    if tree is not None:
+        note_numbered_parts(tree)
     seconds = [f.seconds for f in prepared.figures if np.isfinite(f.seconds)]
     ways = Counter(f.init.lstrip("0123456789 ") for f in prepared.figures)     # without their number
     # the closing table: how many, by which method, how fast, how good
@@ -84,7 +89,7 @@ def summarize(call: Call, count: int, prepared: Prepared, space: Workspace) -> O
             Metric("parts of the skeleton", len(tree.parents) if tree else "none sought"),
             *_quality(verdicts), Metric("unit assumed", call.config.scan.unit or "m")]
     return Outcome(space.folder, rows, {"prepare": call.config}, list(prepared.failures),
-                   judgement=judge_whole(verdicts, tree),
+                   judgement=judge_whole(verdicts, tree, parts=parts),
                    following=f"open {space.folder / 'report.html'}, then "
                    f"scape learn --poses {space.folder} --shapes {space.folder} -o model.npz")
 

@@ -23,7 +23,7 @@ from ..geometry import tables
 from ..geometry.files import name_of, read_mesh, read_scan
 from ..geometry.landmark_names import landmark_name, translate_landmarks
 from ..geometry.landmark_writing import Format, landmark_ending
-from ..geometry.landmarks import known_template_landmarks, write_landmarks
+from ..geometry.landmarks import find_template_landmarks, write_landmarks
 from ..geometry.mesh import Mesh, check_template
 from ..geometry.surface import OrientedPoints, Surface
 from ..geometry.target import orient_by_mesh, target_of
@@ -114,7 +114,7 @@ def template_and_landmarks(template: Path | None, space: Workspace, progress: Pr
         return average_person().mesh, landmarks_of_people()
     body = read_mesh(template)
     check_template(body)
-    known = known_template_landmarks(template, body)
+    known = find_template_landmarks(template, body)
     named = translate_landmarks(known)
     built_in = space.step("template", (body, known), lambda folder: find_landmarks(body, known, progress))
     # names keep the spelling of the file

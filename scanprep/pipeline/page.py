@@ -102,8 +102,9 @@ def judge_set(folder: str | Path, limits: Limits | None = None) -> list[Verdict]
     return sorted(verdicts, key=lambda verdict: (-verdict.badness, verdict.name))
 
 
-def judge_whole(verdicts: Sequence[Verdict], skeleton: Skeleton | None, limits: Limits | None = None) -> Judgement:
-    """Judge a set: its scans, whether most of the surface has data, and joints that a person should have.
+def judge_whole(verdicts: Sequence[Verdict], skeleton: Skeleton | None, limits: Limits | None = None,
+                parts: int | None = None) -> Judgement:
+    """Judge a set: its scans, whether most of the surface has data, and the skeleton, which was to have `parts` parts.
 
     A gap that all scans share is no fault of one scan. Of twenty real people seen from the front 16 are good one by
     one, though in every second man one limb, unseen, is more than 45 mm off.
@@ -112,7 +113,7 @@ def judge_whole(verdicts: Sequence[Verdict], skeleton: Skeleton | None, limits: 
     usual, most = float(np.median(unseen)) if unseen else 0.0, UNSEEN + (limits or Limits()).unseen
     doubts = [f"{100 * usual:.0f}% of a body has no data in these scans: what is there is a guess"] if usual > most \
         else []
-    doubts += skeleton_doubts(skeleton) if skeleton is not None else []
+    doubts += skeleton_doubts(skeleton, parts) if skeleton is not None else []
     return judge_many({verdict.name: verdict.judgement for verdict in verdicts}).merge(Judgement.of(check=doubts))
 
 

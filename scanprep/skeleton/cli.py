@@ -15,7 +15,7 @@ from ..geometry.mesh import Mesh
 from ..judgement import Judgement
 from .edit import apply_edits, read_edits
 from .find import search_skeleton, skeleton_problem
-from .names import skeleton_doubts
+from .names import note_numbered_parts, skeleton_doubts
 from .parts import SkeletonConfig
 from .tree import Skeleton
 
@@ -39,6 +39,7 @@ def skeleton(poses: Annotated[Path, Place("POSES")], output: Output, template: P
     with bar("finding the skeleton") as progress:
         search = search_skeleton(body, vertices, config, progress=progress)
     found = search.skeleton
+    note_numbered_parts(found)
     found.save(output)
     return Outcome(output, [
         Metric("poses", len(vertices)), Metric("parts", len(found.parents)),
@@ -48,7 +49,7 @@ def skeleton(poses: Annotated[Path, Place("POSES")], output: Output, template: P
         *(Metric(f"loop of {loop.length} links opened at",
                  f"{' and '.join(loop.parts)}, {'joined' if loop.joined else 'no longer linked'}")
           for loop in search.loops), *_shares(found, body)], {"skeleton": config},
-                   judgement=Judgement.of(skeleton_problem(search, config.parts), skeleton_doubts(found)))
+                   judgement=Judgement.of(skeleton_problem(search, config.parts), skeleton_doubts(found, config.parts)))
 
 
 def edit(skeleton: Annotated[Path, Place("SKELETON")], output: Output, template: Path | None = None,

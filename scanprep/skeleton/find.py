@@ -67,8 +67,8 @@ def find_skeleton(template: Mesh, poses: np.ndarray, config: SkeletonConfig | No
     Raises
     ------
     ValueError
-        A template that is not one connected manifold; poses of another shape, not finite, or fewer than three; no tree
-        with the requested number of parts; a symmetric skeleton requested of a body without two sides.
+        A template that is not one connected manifold; poses of another shape, not finite, or fewer than three; a
+        symmetric skeleton requested of a body without two sides.
 
     Examples
     --------

@@ -187,11 +187,11 @@ def to_tree(search: PartSearch, label: np.ndarray) -> tuple[np.ndarray, np.ndarr
 
 
 def tree_of(search: PartSearch, label: np.ndarray, links: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Reach a tree of exactly `count` parts, by merging linked parts or cutting the parts that bend most."""
+    """Reach a tree of `count` parts, or the nearest, by merging linked parts or cutting the parts that bend most."""
     while len(links) + 1 != count:
         tree = (fewer_parts if len(links) + 1 > count else more_parts)(search, label, count)
         if tree is None:
-            raise ValueError(f"parts: no tree of {count} parts was found, only one of {len(links) + 1}")
+            break
         label, links = tree
     return label, links
 

@@ -1,6 +1,7 @@
 """Name the parts of people from the tree, its symmetry, and the positions of the parts."""
 from __future__ import annotations
 
+import warnings
 from dataclasses import dataclass
 
 import numpy as np
@@ -8,7 +9,7 @@ import numpy as np
 from ..geometry.mesh import Mesh
 from .roles import missing_joints
 from .symmetry import Symmetry
-from .tree import Skeleton
+from .tree import Skeleton, number_parts
 
 
 def name_parts(template: Mesh, skeleton: Skeleton, symmetry: Symmetry) -> tuple[str, ...]:
@@ -30,23 +31,36 @@ def name_parts(template: Mesh, skeleton: Skeleton, symmetry: Symmetry) -> tuple[
     arm = {1: ("arm",), 2: ("upper_arm", "forearm"), 3: ("upper_arm", "forearm", "hand")}
     leg = {1: ("leg",), 2: ("thigh", "shin"), 3: ("thigh", "shin", "foot")}
     for limbs, kinds, first in ((person.arms, arm, "shoulder"), (person.legs, leg, "hip")):
-        for limb in limbs:
-            side = "left" if (_middle(template, skeleton, limb) - person.centre) @ left > 0 else "right"
-            for part, name in zip(limb, _limb_names(template, skeleton, limb, kinds, first), strict=True):
-                names[part] = f"{name}_{side}"
+        # the two of a pair against each other: on a body that leans both may be on one side of its centre
+        pair = sorted(limbs, key=lambda limb: float(_middle(template, skeleton, limb) @ left))
+        lengths = [np.linalg.norm(np.diff(_bones(template, skeleton, limb), axis=0), axis=1) for limb in pair]
+        segments = _limb_names(np.mean(lengths, axis=0), kinds, first)
+        for side, limb in zip(("right", "left"), pair, strict=True):
+            names |= {part: f"{name}_{side}" for part, name in zip(limb, segments, strict=True)}
     return tuple(names[p] for p in range(len(skeleton.parents)))
 
 
-def skeleton_doubts(skeleton: Skeleton) -> list[str]:
-    """List the joints that a person's skeleton lacks, as reasons of a judgement; none for other bodies."""
+def skeleton_doubts(skeleton: Skeleton, parts: int | None = None) -> list[str]:
+    """List what a skeleton lacks, as reasons of a judgement: `parts` that were asked for, and joints of a person."""
     missing = missing_joints(skeleton.names, skeleton.joints)
-    return [f"the skeleton has no joint at the {', '.join(missing)}: add scans in which the body bends there"] \
+    doubts = [f"the skeleton has no joint at the {', '.join(missing)}: add scans in which the body bends there"] \
         if missing else []
+    if parts is not None and parts != len(skeleton.parents):
+        doubts.insert(0, f"no skeleton of {parts} parts was found, the nearest has {len(skeleton.parents)}: leave out "
+                         "--parts, or add scans in which the body bends at the joints that are missing")
+    return doubts
+
+
+def note_numbered_parts(skeleton: Skeleton) -> None:
+    """Warn where the parts of a skeleton have numbers for names, as on a body that is not recognised as a person."""
+    if len(skeleton.parents) > 1 and skeleton.names == number_parts(len(skeleton.parents)):
+        warnings.warn("the parts are numbered, as they are not those of a person with a clear left and right; name "
+                      "them with scape prep edit-skeleton --rename", stacklevel=2)
 
 
 @dataclass(frozen=True, eq=False)
 class _Person:
-    """Trunk (from the pelvis) and limbs as chains of parts, the up direction and the centre of the hips."""
+    """Trunk (from the pelvis) and limbs as chains of parts, and the up direction."""
 
     spine: list[int]
     arms: list[list[int]]
@@ -54,7 +68,6 @@ class _Person:
     chest: int
     has_head: bool                       # a part of its own at the end of the chain
     up: np.ndarray
-    centre: np.ndarray
 
 
 def part_partners(template: Mesh, skeleton: Skeleton, symmetry: Symmetry) -> np.ndarray | None:
@@ -90,7 +103,7 @@ def _person(template: Mesh, skeleton: Skeleton, symmetry: Symmetry) -> _Person |
     down = np.mean([_bones(template, skeleton, leg)[-1] for leg in legs], axis=0) - hips
     if down @ up > -0.7 * np.linalg.norm(down):
         return None
-    return _Person(spine, arms, legs, limbs[order[2]][0], spine[-1] != limbs[order[2]][0], up, hips)
+    return _Person(spine, arms, legs, limbs[order[2]][0], spine[-1] != limbs[order[2]][0], up)
 
 
 def _limbs(near: dict[int, list[int]], partner: np.ndarray, middle: list[int]) -> list[tuple[int, list[int]]]:
@@ -196,12 +209,10 @@ def _spine_names(person: _Person) -> list[str]:
             "head"]
 
 
-def _limb_names(template: Mesh, skeleton: Skeleton, limb: list[int], kinds: dict[int, tuple[str, ...]], first: str
-                ) -> tuple[str, ...]:
-    """Name a limb from the body outwards; the segments of limbs with more than three are numbered."""
-    lengths = np.linalg.norm(np.diff(_bones(template, skeleton, limb), axis=0), axis=1)
+def _limb_names(lengths: np.ndarray, kinds: dict[int, tuple[str, ...]], first: str) -> tuple[str, ...]:
+    """Name a limb from the body outwards, by the lengths (n,) of its segments; more than three are numbered."""
     lead: tuple[str, ...] = ()
-    if len(limb) in (3, 4) and lengths[0] < 0.45 * lengths[1]:          # too short for an upper arm or thigh
+    if len(lengths) in (3, 4) and lengths[0] < 0.45 * lengths[1]:          # too short for an upper arm or thigh
         lengths, lead = lengths[1:], (first,)
     n, whole = len(lengths), kinds[1][0]
     # elbows and knees are at 0.41 to 0.44 of the length of a limb, wrists and ankles at 0.75 to 0.81

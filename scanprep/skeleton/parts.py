@@ -21,7 +21,7 @@ class SkeletonConfig(Settings):
     Attributes
     ----------
     parts : int, optional
-        Exact number of parts; by default the data decide.
+        Number of parts, or the nearest that gives a tree; by default the data decide.
     separation : float
         Neighbours with a smaller separation are merged, see `PartSearch.separations`.
     tolerance : float

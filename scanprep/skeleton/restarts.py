@@ -192,20 +192,21 @@ def _is_held_back(run: Restart) -> bool:
 
 
 def _of_count(best: Restart, surface: PosedSurface, config: SkeletonConfig) -> tuple[np.ndarray, np.ndarray, bool]:
-    """Return labels and links with the requested number of parts, and whether they are symmetric.
+    """Return labels and links with the requested number of parts, or the nearest, and whether they are symmetric.
 
-    If no symmetric tree has that number, the symmetry is given up.
+    If no symmetric tree has that number, the symmetry is given up for one that is nearer.
     """
-    tied = best.search.sides.tied
-    if config.parts is None:
+    tied, wanted = best.search.sides.tied, config.parts
+    if wanted is None:
         return best.label, best.links, tied
-    try:
-        label, links = tree_of(best.search, best.label, best.links, config.parts)
-        return *(_settle(best.search, label, links) if tied else (label, links)), tied
-    except ValueError:
-        if not tied or config.symmetric:
-            raise
-    return *tree_of(PartSearch(surface, config), best.label, best.links, config.parts), False
+    label, links = tree_of(best.search, best.label, best.links, wanted)
+    if not tied:
+        return label, links, False
+    if len(links) + 1 != wanted and not config.symmetric:
+        free = tree_of(PartSearch(surface, config), best.label, best.links, wanted)
+        if abs(len(free[1]) + 1 - wanted) < abs(len(links) + 1 - wanted):
+            return *free, False
+    return *_settle(best.search, label, links), True
 
 
 def _assemble(template: Mesh, label: np.ndarray, links: np.ndarray, joints: np.ndarray) -> Skeleton:

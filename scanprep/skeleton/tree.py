@@ -69,7 +69,7 @@ class Skeleton:
             raise ValueError(f"part_of_face: expected every part of 0..{J - 1} to have triangles, "
                              f"found {np.unique(part_of_face).tolist()}")
         # store read-only copies
-        names = tuple(self.names) or tuple(f"part{j}" for j in range(J))
+        names = tuple(self.names) or number_parts(J)
         if len(names) != J or len(set(names)) != J or not all(isinstance(name, str) for name in names):
             raise ValueError(f"names: expected {J} different names, got {list(names)}")
         for name, value in (("part_of_face", part_of_face), ("parents", parents), ("joints", joints)):
@@ -189,6 +189,11 @@ class Skeleton:
                                        f"(known: {Skeleton.VERSION})")
         with storage.taking_apart(path, "a whole skeleton"):
             return Skeleton(stored["part_of_face"], stored["parents"], stored["joints"], tuple(stored["names"]))
+
+
+def number_parts(count: int) -> tuple[str, ...]:
+    """Return names for parts without names."""
+    return tuple(f"part{j}" for j in range(count))
 
 
 def affine_weights(points: np.ndarray, target: np.ndarray) -> np.ndarray:
