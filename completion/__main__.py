@@ -8,6 +8,8 @@ from scanprep.interrupts import leave_at_once
 # name -> line of help, function; modules are imported when their command is called
 COMMANDS = {
     "demo": ("The whole chain on synthetic scans; ends with a page to open.", "completion.demo.cli:demo"),
+    "sample": ("Files to try every command with: raw scans, a half view, a walk.",
+               "completion.demo.sample:write_sample"),
     "prep": ("Scans -> registered meshes and a skeleton; also its single stages.", "scanprep.cli:group"),
     "view": ("Meshes, scans, models, motions and results in the browser.", "completion.viewing.cli:view_files"),
     "measure": ("Stature, girths, lengths and widths of bodies; or a body that has them.",

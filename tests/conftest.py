@@ -57,28 +57,43 @@ def run_folder(tmp_path_factory):
     return base.parent if "PYTEST_XDIST_WORKER" in os.environ else base
 
 
-@pytest.fixture(scope="session")
-def demo_folder(run_folder):
-    """The folder of one `scape demo --quick`, run once for all tests that look at it, in whatever process."""
-    folder, ended = run_folder / "demo" / "scape_demo", run_folder / "demo.ended"
+def made_once(folder, make):
+    """A folder that `make` fills once for all processes of this run; whoever comes later waits for it."""
+    ended = folder.parent.with_name(f"{folder.name}.ended")
     try:
         folder.parent.mkdir()
     except FileExistsError:                                  # another process is at it
         while not ended.exists():
             time.sleep(0.5)
     else:
-        from quiet_pictures import coarse_pictures
-
-        from completion.demo.cli import demo
-
         code = None
         try:
-            with coarse_pictures():
-                code = run(demo, "scape demo", ["--quick", "--output", str(folder)])
+            code = make()
         finally:
             ended.write_text(str(code))
     assert ended.read_text() == "0"
     return folder
+
+
+@pytest.fixture(scope="session")
+def demo_folder(run_folder):
+    """The folder of one `scape demo --quick`, run once for all tests that look at it, in whatever process."""
+    from quiet_pictures import coarse_pictures
+
+    from completion.demo.cli import demo
+
+    folder = run_folder / "demo" / "scape_demo"
+    with coarse_pictures():
+        return made_once(folder, lambda: run(demo, "scape demo", ["--quick", "--output", str(folder)]))
+
+
+@pytest.fixture(scope="session")
+def sample_folder(run_folder):
+    """The folder of one `scape sample`, in which nothing is written."""
+    from completion.demo.sample import write_sample
+
+    folder = run_folder / "first_minute" / "sample"
+    return made_once(folder, lambda: run(write_sample, "scape sample", ["--output", str(folder)]))
 
 
 @pytest.fixture(scope="session")

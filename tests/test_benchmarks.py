@@ -131,4 +131,5 @@ def test_every_result_makes_its_table_and_its_headlines(benchmarks):
         report = json.loads((FOLDER / "results" / f"{one.name}.json").read_text())
         assert "|" in one.table(report), one.name
         for line in benchmarks.HEADLINES.get(one.name, lambda report: [])(report):
-            assert len(line) == 2 and all(line), one.name
+            what, figure = line
+            assert what and re.fullmatch(r"[\d.,]+( of \d+)?( ?(mm|s|MB|MiB|%|°))?", figure), (one.name, line)

@@ -62,6 +62,11 @@ def test_everything_is_in_the_one_file(image, tmp_path):
     assert [a["href"] for a in read.all("nav") and read.all("a")[:3]] == ["#s1", "#s2", "#s3"]
 
 
+def test_a_page_says_that_nothing_leaves_the_computer_and_where_the_files_are():
+    words = " ".join(Reader(Page("walk").html()).words)
+    assert "no data leave your computer" in words and "in the folder of this page" in words
+
+
 def test_text_is_escaped():
     nasty = '<script>alert("x")</script>'
     page = Page(nasty, nasty).section(nasty, nasty).table([(nasty,)], (nasty,))

@@ -47,9 +47,8 @@ from ..mocap.marker_sets.layout import DISTANCE, MarkerLayout
 from ..mocap.pose.follow import animate
 from ..motion import Motion
 from ..partial.completion import Completion, complete, load_completion, save_completion
+from .sample import MARKER_NOISE, record_markers
 from .truth import TruthMap, distance, surface_error
-
-MARKER_NOISE = 0.001                     # metres: standard deviation per axis, as optical motion capture has
 
 
 @dataclass(frozen=True)
@@ -318,18 +317,9 @@ class Demo:
 def record_walk(folder: Path, bodies: np.ndarray, rest: GroundTruth, template: Mesh, config: DemoConfig,
                 report_progress: Callable[[int, int], None]) -> None:
     """Write the markers of a walking person (T, N, 3), and their places on the template."""
-    rng = np.random.default_rng([config.seed, 9])
-    labels, places = tuple(MARKERS), np.array(list(MARKERS.values()))
-    exact_markers = []
-    for i, body in enumerate(bodies):
-        exact_markers.append(body[places] + DISTANCE * Mesh(body, rest.faces).vertex_normals[places])
-        report_progress(i + 1, len(bodies))
-    positions = np.stack(exact_markers) + rng.normal(0, MARKER_NOISE, (len(bodies), len(labels), 3))
-    # 3% of the markers are missing at any time, as behind an arm
-    positions[rng.random(positions.shape[:2]) < 0.03] = np.nan
+    sequence = record_markers(bodies, rest.faces, config.rate, np.random.default_rng([config.seed, 9]), report_progress)
     # as with a real subject, the layout is read from the scan at rest, on which the markers are visible
-    _, vertices = cKDTree(template.vertices).query(rest.vertices[places])
-    MarkerLayout(labels, vertices, DISTANCE).save(folder / "layout.json")
-    sequence = MarkerSequence(positions, labels, config.rate)
+    _, vertices = cKDTree(template.vertices).query(rest.vertices[list(MARKERS.values())])
+    MarkerLayout(tuple(MARKERS), vertices, DISTANCE).save(folder / "layout.json")
     write_markers(folder / "walk.csv", sequence)
     write_markers(folder / "walk.c3d", sequence)

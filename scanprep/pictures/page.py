@@ -31,6 +31,9 @@ script.textContent = text;
 document.head.append(script);
 scapekit.start();
 })().catch((error) => { document.body.classList.add("sk-pictures-only"); throw error; });"""
+# at the end of every page: what a person who scans people has to know before sending it to anybody
+PRIVACY = ("scapekit works without a network: no data leave your computer, unless you name a cluster. "
+           "The files of this result are in the folder of this page.")
 # text that is a number, with thousands separators and exponent: set flush right in tables
 NUMBER = re.compile(r"[-+]?[\d,]*\.?\d+(e[-+]?\d+)?")
 
@@ -144,7 +147,8 @@ class Page:
                 f'<meta name="viewport" content="width=device-width, initial-scale=1">\n'
                 f"<title>{escape(self.title)}</title>\n<style>{style}</style>\n</head>\n<body>\n<main>\n"
                 f"<header><h1>{escape(self.title)}</h1>{lead}{self._verdict}{nav}</header>\n"
-                + "\n".join(self._parts) + "\n</main>\n" + viewer + "</body>\n</html>\n")
+                + "\n".join([*self._parts, f"<footer>{escape(PRIVACY)}</footer>"])
+                + "\n</main>\n" + viewer + "</body>\n</html>\n")
 
     def write(self, path: str | Path) -> None:
         """Write the page to a file, completely or not at all."""

@@ -27,7 +27,7 @@ import shutil
 import subprocess
 import sys
 import time
-from collections.abc import Collection
+from collections.abc import Mapping
 from functools import cache
 from pathlib import Path
 
@@ -210,14 +210,14 @@ def shown(one: Benchmark, runner: Runner) -> str:
     return "\n\n".join(part for part in (head + took, one.table(json.loads(path.read_text())), one.note) if part) + "\n"
 
 
-def headlines(runner: Runner, names: Collection[str]) -> str:
-    """A table of the main figures of some benchmarks, with the command of each."""
+def headlines(runner: Runner, most: Mapping[str, int | None]) -> str:
+    """A table of the main figures of some benchmarks, one a row, so many of each, with the command."""
     rows: Rows = []
     for one in BENCHMARKS:
-        if one.name in names and runner.is_done(one):
+        if one.name in most and runner.is_done(one):
             report = json.loads((RESULTS / f"{one.name}.json").read_text())
-            rows += [(*line, f"`{runner.arguments(one)}`") for line in HEADLINES[one.name](report)]
-    return table(("", "", "command"), rows)
+            rows += [(*line, f"`{runner.arguments(one)}`") for line in HEADLINES[one.name](report)[:most[one.name]]]
+    return table(("what", "error or value", "command"), rows)
 
 
 def into_readme(figures: str) -> None:
@@ -243,7 +243,7 @@ def write_tables(runner: Runner) -> None:
     if runner.quick:
         parts.append("\n`--quick` takes fewer bodies where there are many"
                      + (f", and leaves out {', '.join(one.name for one in out)}" if out else "") + ".\n")
-    parts.append(f"\n## In short\n\n{headlines(runner, HEADLINES)}\n")
+    parts.append(f"\n## In short\n\n{headlines(runner, dict.fromkeys(HEADLINES))}\n")
     parts += [shown(one, runner) for one in here]
     (HERE / "BENCHMARKS.md").write_text("".join(parts))
 
