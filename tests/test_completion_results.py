@@ -84,7 +84,7 @@ def test_parts_that_may_be_far_off_are_named_the_worst_first():
     seen[np.flatnonzero(fit.part == 1)[::2]] = False
     error[fit.part == 2], seen[fit.part == 2] = 0.25, False
     assert completion_doubts(fit, x, error, seen) == ["the left forearm may be 250 mm off, nothing of it was seen",
-                                                      "the left upper arm may be 80 mm off, 50% of it was seen"]
+                                                      "the left upper arm may be 80 mm off, 49% of it was seen"]
 
 
 def test_a_model_of_too_few_poses_is_doubted_and_its_errors_are_expected():

@@ -274,7 +274,7 @@ def test_correspondences_in_a_file(place, tmp_path, capsys, quick):
     write_correspondences(tmp_path / "few.json", Correspondences(np.arange(642)[::90], few, np.ones(len(few))))
     assert run("register", scan, "--template", place / "template.ply", "--through", tmp_path / "few.json",
                "-o", tmp_path / "registered.ply") == 0
-    assert report(tmp_path / "registered.ply.report.json")["vertices with data"] > 95
+    assert report(tmp_path / "registered.ply.report.json")["surface with data"] > 95
 
 
 def test_files_of_correspondences(tmp_path):

@@ -76,7 +76,7 @@ class Completion:
     rms : float, metres
         Distance of the scan points that were used to the completed mesh.
     explained : float
-        Share of the scan points that were used.
+        Share of the scanned surface that was used: on the body, and facing as it does.
     landmark_rms : float, metres
         Distance of the landmarks to their vertices on the predicted mesh; NaN when there are none.
     converged : bool
@@ -126,6 +126,11 @@ class Completion:
     confidence: np.ndarray | None = None
     judgement: Judgement = UNJUDGED
     soles: tuple[float, float] | None = None
+
+    @property
+    def measured(self) -> float:
+        """Share of the body's surface that was observed."""
+        return self.completed.share_of_area(self.seen)
 
 
 @one_thread()
@@ -205,7 +210,7 @@ def complete(body: BodyModel | Subject, scan: Scan, landmarks: tuple[np.ndarray,
     completed = completed if standing is None else completed.with_vertices(standing.vertices)
     # a depth picture shows clothes, and its noise is larger than the model's error
     if cloud.person is not None:
-        completed, rms = predicted, distance_to(predicted, cloud.points[used])
+        completed, rms = predicted, distance_to(predicted, cloud.some(used))
     # the expected error of every vertex, and the residuals of the landmarks
     error = estimate_error(open_error, distance_to_seen(predicted, seen), rms, person.left_out_error)
     report_progress(total, total)
@@ -213,12 +218,12 @@ def complete(body: BodyModel | Subject, scan: Scan, landmarks: tuple[np.ndarray,
     shape = body.betas if isinstance(body, Subject) else betas if person.n_betas else None
     distances = np.linalg.norm(predicted.vertices[inputs.vertices] - inputs.points, axis=1)
     landmark_rms = float(np.sqrt((distances**2).mean())) if len(distances) else np.nan
-    result = Completion(completed, predicted, pose, shape, trans, seen, rms, float(used.mean()), landmark_rms,
+    result = Completion(completed, predicted, pose, shape, trans, seen, rms, cloud.share_of_area(used), landmark_rms,
                         solved.converged, solved.rounds, solved.energies, inputs.metres, error,
                         probability_within(error, config.tolerance), soles=standing.beyond if standing else None)
     # judge the result: reasons why it means nothing, then reasons to look at it
     problems = [completion_problem(result, inputs.cloud.points, config.free_scale),
-                find_contortion(fit, solved.x, float(seen.mean()), len(distances) > 0)]
+                find_contortion(fit, solved.x, result.measured, len(distances) > 0)]
     doubts = (completion_doubts(fit, solved.x, error, seen) + find_unexplained(fit, result.explained)
               + ambiguous(fit, solved.x, rival))
     doubts += beyond_closed(scan, completed) if isinstance(scan, Mesh) and not config.free_scale else []
@@ -252,14 +257,15 @@ def completion_doubts(fit: ScanFit, x: np.ndarray, error: np.ndarray, seen: np.n
     border of a picture are a guess and give no reason.
     """
     names, doubts, shown = fit.body.skeleton.names, [], ~fit.beyond(x)
+    areas = fit.body.template.vertex_areas
     # parts with a large expected error, the worst first; less than half within the picture counts as outside
     open_parts = [(float(np.sqrt((error[of_part]**2).mean())), p) for p in range(len(names))
                   if (of_part := fit.part == p).any() and shown[of_part].mean() >= 0.5]
     for off, p in sorted(open_parts, reverse=True):
         if off > DOUBTFUL:
-            share = f"{100 * seen[fit.part == p].mean():.0f}% of it was seen" if seen[fit.part == p].any() else \
-                "nothing of it was seen"
-            doubts.append(f"the {in_words(names[p])} may be {1000 * off:.0f} mm off, {share}")
+            share = areas[seen & (fit.part == p)].sum() / areas[fit.part == p].sum()
+            much = f"{100 * share:.0f}% of it was seen" if share else "nothing of it was seen"
+            doubts.append(f"the {in_words(names[p])} may be {1000 * off:.0f} mm off, {much}")
     # joints far from every known pose
     strange = fit.body.joints_from_known(fit.body.split(x)[0])
     doubts += [f"the {joint_in_words(names[j])} is {np.degrees(strange[j]):.0f} degrees from any way that it is known "
@@ -311,8 +317,8 @@ def find_stray(fit: ScanFit, x: np.ndarray) -> list[str]:
     # shares of the body in free space, and of the person's points without a body near
     entered = free_space_violation(fit.data.cameras, fit.mesh(x).vertices[fit.sample.matched]).excess > 0
     lost, doubts = fit.find_unexplained(x, fit.thin), []
-    if lost.mean() > LOST_LIMB:
-        doubts.append(f"{100 * lost.mean():.1f}% of what was seen of the person has no body near")
+    if (share := fit.thin.share_of_area(lost)) > LOST_LIMB:
+        doubts.append(f"{100 * share:.1f}% of what was seen of the person has no body near")
     if entered.mean() > ENTERED:
         doubts.append(f"{100 * entered.mean():.1f}% of the body is where the camera saw that nothing is")
     return doubts
@@ -329,13 +335,13 @@ def completion_problem(done: Completion, points: np.ndarray, free_scale: bool = 
     # two people at 0.58, which is a right result for that person
     lost = 0.5
     covered = 0.5  # share of the body with data, below which CROWDED is asked; one of two people has 0.94
-    least = CROWDED if done.seen.mean() < covered else lost
+    least = CROWDED if done.measured < covered else lost
     far_off = relative_error > HAND or (relative_error > ASTRAY and explained < ENOUGH)
     if wrong is None and done.seen.any() and explained >= least and not far_off:
         return None
     # name the likely cause: the unit, the landmarks, or another subject
     marks = "" if np.isnan(done.landmark_rms) else f", the landmarks are {1000 * done.landmark_rms:.0f} mm off"
-    return (f"the body explains {100 * done.explained:.0f}% of the scan, {100 * done.seen.mean():.2g}% of it has "
+    return (f"the body explains {100 * done.explained:.0f}% of the scan, {100 * done.measured:.2g}% of it has "
             f"data{marks}; " + (wrong or ("landmarks of other places, left and right exchanged, or " if marks else "")
                                 + "a scan of something else, another model?"))
 

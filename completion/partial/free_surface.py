@@ -82,12 +82,14 @@ def free_surface(predicted: Mesh, cloud: ScanPoints, config: CompletionConfig
     # a vertex was observed when a used point lies on one of its triangles
     seen = np.zeros(len(predicted.vertices), dtype=bool)
     seen[predicted.faces[closest.faces[used]]] = True
-    return mesh, seen, used, distance_to(mesh, cloud.points[used])
+    return mesh, seen, used, distance_to(mesh, cloud.some(used))
 
 
-def distance_to(mesh: Mesh, points: np.ndarray) -> float:
-    """Compute the root mean square distance of points (n, 3) to a mesh, metres; NaN without points."""
-    return float(np.sqrt((Surface(mesh).closest(points).distances**2).mean())) if len(points) else np.nan
+def distance_to(mesh: Mesh, cloud: ScanPoints) -> float:
+    """Compute the root mean square distance of a scanned surface to a mesh, metres; NaN without points."""
+    if not len(cloud.points):
+        return np.nan
+    return float(np.sqrt(np.average(Surface(mesh).closest(cloud.points).distances**2, weights=cloud.areas)))
 
 
 def _rows(mesh: Mesh, faces: np.ndarray, bary: np.ndarray) -> csr_array:

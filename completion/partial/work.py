@@ -144,10 +144,11 @@ def completion_figures(work: CompletionTask, inputs: CompletionInputs, done: Com
                        masked: np.ndarray | None) -> list[Metric]:
     """The rows of the closing table."""
     rows = [Metric(EXPLAINED, 100 * done.explained, "%"),
-            Metric(MEASURED, 100 * float(done.seen.mean()), "%"),
+            Metric(MEASURED, 100 * done.measured, "%"),
             Metric("landmarks used", "none" if landmarks is None else len(landmarks[0]))]
     if done.expected_error is not None:
-        rows.insert(0, Metric(EXPECTED, MM * float(np.nanmean(done.expected_error)), "mm"))
+        error = float(np.average(done.expected_error, weights=done.completed.vertex_areas))
+        rows.insert(0, Metric(EXPECTED, MM * error, "mm"))
     if landmarks is not None:
         rows.append(Metric("landmarks to the model's own body, RMS", MM * done.landmark_rms, "mm"))
     if len(inputs.scans) > 1:

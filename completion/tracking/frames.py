@@ -57,7 +57,9 @@ def prepare_frame(frame: Frame, count: int, neighbours: int, viewpoints: Any = N
     # borders are those of all views together
     border, spacing = _borders(points, normals, dense, neighbours)
     number = np.repeat(np.arange(len(parts)), [len(part[0]) for part in parts])
-    return ScanPoints(points, normals, border, spacing, number, np.arange(len(points)))
+    # the points were spread evenly above
+    even = np.full(len(points), spacing**2)
+    return ScanPoints(points, normals, border, spacing, number, np.arange(len(points)), even)
 
 
 def frame_views(cloud: ScanPoints) -> list[PointCloud]:

@@ -12,11 +12,11 @@ from scanprep.depth_camera.person import PicturedPerson, segment_person
 from scanprep.depth_camera.picture import DepthPicture
 from scanprep.geometry.files import PointCloud
 from scanprep.geometry.mesh import Mesh
-from scanprep.geometry.places import distinct_places
+from scanprep.geometry.places import areas_by_neighbours, distinct_places
 from scanprep.geometry.sanitise import sanitise
 from scanprep.threads import search_threads
 
-from .normals import complete_normals, one_sign, plane_normals, spread_points, turn_outward
+from .normals import GRAZING, complete_normals, one_sign, plane_normals, spread_points, turn_outward
 
 NEIGHBOURS = 16                      # points that determine one normal: enough to average out noise
 
@@ -34,6 +34,7 @@ class ScanPoints:
     spacing: float          # metres, median distance of neighbouring points
     view: np.ndarray        # (n,) int, which view each point belongs to
     index: np.ndarray       # (n,) int, number of the point among all input points, one view after the other
+    areas: np.ndarray       # (n,) square metres, the surface that each point stands for
     masked: ScanPoints | None = None  # points of clothing or hair, which are not among `points`
     viewpoints: np.ndarray | None = None  # (views, 3), metres, where given
     person: PicturedPerson | None = None      # the person in the depth picture that the points are from
@@ -51,7 +52,11 @@ class ScanPoints:
     def some(self, keep: np.ndarray) -> ScanPoints:
         """Select some of the points, by number or mask (n,); the clothing stays."""
         return replace(self, points=self.points[keep], normals=self.normals[keep], border=self.border[keep],
-                       view=self.view[keep], index=self.index[keep])
+                       view=self.view[keep], index=self.index[keep], areas=self.areas[keep])
+
+    def share_of_area(self, chosen: np.ndarray) -> float:
+        """Compute the share of the scanned surface at chosen points (n,) bool."""
+        return float(self.areas @ chosen / self.areas.sum())
 
     def thin(self, count: int) -> ScanPoints:
         """Reduce the points to about `count`, spread evenly."""
@@ -62,8 +67,8 @@ class ScanPoints:
         masked = None if self.masked is None else self.masked.scale_by(factor)
         seen_from = None if self.viewpoints is None else factor * self.viewpoints
         assert self.person is None or factor == 1, "a picture is in metres"
-        return replace(self, points=factor * self.points, spacing=factor * self.spacing, masked=masked,
-                       viewpoints=seen_from)
+        return replace(self, points=factor * self.points, spacing=factor * self.spacing, areas=factor**2 * self.areas,
+                       masked=masked, viewpoints=seen_from)
 
 
 def prepare_scan(scan: View | Sequence[View], viewpoint: Any = None, masked: np.ndarray | None = None,
@@ -93,9 +98,12 @@ def prepare_picture(picture: DepthPicture, size: float, marks: np.ndarray) -> Sc
     """
     person = segment_person(picture, size, marks)
     points, normals, edge = person.points_and_normals()
-    spacing = float(np.median(points[:, 2])) / person.picture.intrinsics[0, 0]
-    every = np.arange(len(points))
-    return ScanPoints(points, normals, edge, spacing, 0 * every, every, viewpoints=np.zeros((1, 3)), person=person)
+    pixels, every = points[:, 2] / person.picture.intrinsics[0, 0], np.arange(len(points))
+    # a pixel sees more of surfaces that are farther away, and of oblique ones
+    cosines = np.abs(np.einsum("nd,nd->n", normals, points)) / np.linalg.norm(points, axis=1)
+    areas = pixels**2 / np.maximum(cosines, GRAZING)
+    return ScanPoints(points, normals, edge, float(np.median(pixels)), 0 * every, every, areas,
+                      viewpoints=np.zeros((1, 3)), person=person)
 
 
 def as_views(scan: View | Sequence[View]) -> list[View]:
@@ -162,12 +170,12 @@ def _prepare_view(scan: View, viewpoint: np.ndarray | None, name: str) -> ScanPo
     if not np.isfinite(points).all():
         bad = np.flatnonzero(~np.isfinite(points).all(axis=1))
         raise ValueError(f"{name}: {len(bad)} points are not finite, the first is point {bad[0]}")
-    # of a mesh, vertices with triangles count, and their normals are known
-    index, border = distinct_places(points), np.zeros(len(points), dtype=bool)
+    # of a mesh, vertices with triangles count, and their normals and areas are known
+    index, border, areas = distinct_places(points), np.zeros(len(points), dtype=bool), np.zeros(len(points))
     meshed = isinstance(scan, Mesh) and len(scan.faces) > 0
     if isinstance(scan, Mesh) and meshed:
         scan = sanitise(scan, name)
-        own_normals = scan.vertex_normals
+        own_normals, areas = scan.vertex_normals, scan.vertex_areas
         border[scan.boundary_vertices] = True
         index = np.flatnonzero((own_normals != 0).any(axis=1))
         index = index[distinct_places(points[index])]
@@ -179,14 +187,14 @@ def _prepare_view(scan: View, viewpoint: np.ndarray | None, name: str) -> ScanPo
     distance, near = cKDTree(points).query(points, NEIGHBOURS, workers=search_threads(len(points)))
     spacing = float(np.median(distance[:, 1:5].mean(axis=1)))
     if meshed and own_normals is not None:
-        return ScanPoints(points, own_normals, border, spacing, 0 * index, index)
+        return ScanPoints(points, own_normals, border, spacing, 0 * index, index, areas[index])
     # bare points: normals by planes, oriented to the viewpoint where one is known, else by their neighbourhood
     normals = plane_normals(points, near) if own_normals is None else complete_normals(own_normals, points, near)
     if viewpoint is not None:
         normals = normals * np.where(np.einsum("nd,nd->n", normals, viewpoint - points) < 0, -1, 1)[:, None]
     elif own_normals is None or not one_sign(normals, near):
         normals = turn_outward(points, normals, near, distance, 4 * spacing)
-    return ScanPoints(points, normals, border, spacing, 0 * index, index)
+    return ScanPoints(points, normals, border, spacing, 0 * index, index, areas_by_neighbours(distance))
 
 
 def _split(scan: View, name: str) -> tuple[np.ndarray, np.ndarray | None]:
@@ -205,9 +213,9 @@ def _split(scan: View, name: str) -> tuple[np.ndarray, np.ndarray | None]:
 
 
 def _concatenate(parts: Sequence[ScanPoints]) -> ScanPoints:
-    points, normals, border, view, index = (np.concatenate([getattr(part, name) for part in parts])
-                                            for name in ("points", "normals", "border", "view", "index"))
-    return ScanPoints(points, normals, border, float(np.median([part.spacing for part in parts])), view, index)
+    names = ("points", "normals", "border", "view", "index", "areas")
+    joined = {name: np.concatenate([getattr(part, name) for part in parts]) for name in names}
+    return ScanPoints(**joined, spacing=float(np.median([part.spacing for part in parts])))
 
 
 def _without_inner_borders(scan: ScanPoints) -> ScanPoints:

@@ -106,6 +106,10 @@ class Mesh:
         corner, count = self.faces.T.ravel(), len(self.vertices)
         return _unit(np.stack([np.bincount(corner, np.tile(along, 3), count) for along in self._cross.T], axis=1))
 
+    def share_of_area(self, chosen: np.ndarray) -> float:
+        """Compute the share of the surface at chosen vertices (N,) bool; vertices may be denser in some places."""
+        return float(self.vertex_areas @ chosen / self.vertex_areas.sum())
+
     @cached_property
     def vertex_areas(self) -> np.ndarray:
         """(N,) a third of the area of the triangles around each vertex, square metres."""

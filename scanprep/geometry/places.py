@@ -6,6 +6,9 @@ from scipy.spatial import cKDTree
 
 from ..threads import search_threads
 from .farthest_points import thin
+from .mesh import Mesh
+
+NEIGHBOURS = 16                      # points, itself included, whose disc tells the area that a point stands for
 
 
 def distinct_rows(rows: np.ndarray) -> np.ndarray | None:
@@ -31,6 +34,41 @@ def distinct_places(points: np.ndarray) -> np.ndarray:
     """Return the indices of points (n, 3) that repeat no earlier one, ascending."""
     of = distinct_rows(points)
     return np.arange(len(points)) if of is None else np.flatnonzero(of == np.arange(len(of)))
+
+
+def point_areas(scan: Mesh | np.ndarray) -> np.ndarray:
+    """Compute the surface area that each point of a scan stands for, so that shares do not depend on its density.
+
+    Parameters
+    ----------
+    scan : Mesh or (n, 3) float
+        A vertex of a mesh stands for a third of its triangles, a bare point for its share of the disc to its
+        neighbours.
+
+    Returns
+    -------
+    (n,) float
+        Areas in the square of the scan's unit.
+
+    Examples
+    --------
+    >>> x, y = np.meshgrid(np.concatenate([np.arange(0.0, 10), np.arange(10, 20, 0.5)]), np.arange(20.0))
+    >>> areas = point_areas(np.stack([x, y, 0 * x], axis=-1).reshape(-1, 3))
+    >>> round(float(areas[x.ravel() < 10].sum() / areas.sum()), 1)                # a third of the points
+    0.5
+    """
+    if isinstance(scan, Mesh) and len(scan.faces):
+        return scan.vertex_areas
+    points = scan.vertices if isinstance(scan, Mesh) else scan
+    apart, _ = cKDTree(points).query(points, min(NEIGHBOURS, len(points)), workers=search_threads(len(points)))
+    return areas_by_neighbours(apart)
+
+
+def areas_by_neighbours(apart: np.ndarray) -> np.ndarray:
+    """Compute the area (n,) that each point stands for, from the distances (n, k) to its neighbours, itself first."""
+    areas = np.pi * apart[:, -1]**2 / max(1, apart.shape[1] - 1)
+    # stray points far from all others stand for no surface: at most nine times the median, three times the spacing
+    return np.minimum(areas, 9 * np.median(areas))
 
 
 def spacing(points: np.ndarray) -> float:

@@ -121,7 +121,7 @@ def _quality(verdicts: Sequence[Verdict]) -> list[Metric]:
         return float(values[np.isfinite(values)].mean()) if np.isfinite(values).any() else np.nan
 
     return [Metric("distance to the scan, mean", MM * mean("distance"), "mm"),
-            Metric("vertices with data, mean", 100 * mean("seen"), "%"),
+            Metric("surface with data, mean", 100 * mean("seen"), "%"),
             Metric("scan off the template, mean", 100 * mean("missed"), "%"),
             Metric("distance of landmarks, mean RMS", MM * mean("landmarks"), "mm"),
             Metric("inverted triangles", sum(f.inverted for f in figures)),

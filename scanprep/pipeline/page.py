@@ -120,7 +120,7 @@ def judge_whole(verdicts: Sequence[Verdict], skeleton: Skeleton | None, limits: 
 def _summary(verdicts: Sequence[Verdict]) -> list[tuple[str, float, float, str]]:
     """Return rows of median and worst value of each figure over the registered scans."""
     known = [v.figures for v in verdicts if v.figures is not None and not v.failed]
-    rows = (("distance to the scan, mean", 1000, "distance", "mm", max), ("vertices with data", 100, "seen", "%", min),
+    rows = (("distance to the scan, mean", 1000, "distance", "mm", max), ("surface with data", 100, "seen", "%", min),
             ("scan off the template", 100, "missed", "%", max), ("stretched or shrunk", 100, "stretch", "%", max),
             ("inverted triangles", 1, "inverted", "", max), ("landmarks off, RMS", 1000, "landmarks", "mm", max))
     table = []

@@ -175,7 +175,7 @@ def register_one(scan: ScanArg, template: Path, output: Output, landmarks: Path 
     write_mesh(output, fit.mesh)
     return Outcome(output, [
         *led_by, Metric("distance to the scan, RMS", MM * fit.rms, "mm"),
-        Metric("vertices with data", 100 * float(fit.seen.mean()), "%"),
+        Metric("surface with data", 100 * fit.measured, "%"),
         Metric("confidence, mean", float(fit.confidence.mean())),
         Metric("scan off the template", 100 * fit.uncovered, "%"),
         Metric("distance of landmarks, RMS", MM * fit.landmark_rms, "mm"),

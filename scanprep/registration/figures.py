@@ -34,11 +34,11 @@ class ScanFigures:
 
     name: str
     init: str               # what led the template there: "10 landmarks", "160 correspondences", "pose"
-    distance: float         # metres, mean of the vertices with data to the surface of the scan
+    distance: float         # metres, mean over the surface with data to the surface of the scan
     rms: float              # metres, of the same
-    seen: float             # share of the vertices with data
-    confidence: float       # mean over all vertices, from 0 to 1
-    missed: float           # share of the scan's points off the template: a limb it does not cover, or clutter
+    seen: float             # share of the surface with data
+    confidence: float       # mean over the surface, from 0 to 1
+    missed: float           # share of the scanned surface off the template: a limb it does not cover, or clutter
     stretch: float          # share of the surface more than twice, or less than half, as long in some direction
     landmarks: float        # metres, RMS distance of the landmarks; NaN without
     inverted: int           # triangles that face against their surroundings
@@ -51,9 +51,10 @@ class ScanFigures:
 
 def figures_of(name: str, init: str, template: Mesh, fit: Registration) -> ScanFigures:
     """Compute the quality figures of one registration; `init` says how the template was initialised."""
+    areas, seen = fit.mesh.vertex_areas, fit.seen
     return ScanFigures(
-        name, init, float(np.nanmean(fit.distances)) if fit.seen.any() else np.nan, fit.rms,
-        float(fit.seen.mean()), float(fit.confidence.mean()), fit.uncovered,
+        name, init, float(np.average(fit.distances[seen], weights=areas[seen])) if seen.any() else np.nan, fit.rms,
+        fit.measured, float(np.average(fit.confidence, weights=areas)), fit.uncovered,
         share_stretched(template, fit.mesh), fit.landmark_rms, fit.inverted, fit.converged, rolled=fit.rolled)
 
 
@@ -133,7 +134,7 @@ class Limits(Settings):
     missed : float
         Share of the scan's points off the template.
     distance : float
-        Mean distance of the vertices with data to the scan, over the size.
+        Mean distance of the surface with data to the scan, over the size.
     unseen : float
         Share of vertices without data, above what is usual in the set (its median).
     stretch : float

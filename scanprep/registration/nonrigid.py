@@ -19,6 +19,7 @@ from scipy.spatial import cKDTree
 
 from ..correspondence.correspondences import Correspondences
 from ..geometry.mesh import Mesh
+from ..geometry.places import point_areas
 from ..geometry.surface import OrientedPoints, Surface, check_points
 from ..geometry.target import Target, orient_by_mesh
 from ..judgement import HAND, extent, size, unit_problem
@@ -57,7 +58,7 @@ class Registration:
     confidence : (N,) float
         From 0, extrapolated from the surroundings, to 1, data here by matches in both directions.
     uncovered : float
-        Share of the scan's points that lie more than a hundredth of the template's size (the root of its area) off it.
+        Share of the scanned surface more than a hundredth of the template's size (the root of its area) off it.
         More than half a per cent is a limb in the wrong place, or clutter. `converged` does not show that.
     rolled : bool
         Limbs were re-rolled by `repair_limbs`.
@@ -87,6 +88,11 @@ class Registration:
     uncovered: float
     rolled: bool = False
     soles: tuple[float, float] | None = None
+
+    @property
+    def measured(self) -> float:
+        """Share of the template's surface with data."""
+        return self.mesh.share_of_area(self.seen)
 
 
 @dataclass(frozen=True, eq=False)
@@ -239,7 +245,7 @@ def registration_problem(template: Mesh, scan: Mesh | np.ndarray, fit: Registrat
     `marked` says whether landmarks were used.
     """
     points = scan.vertices if isinstance(scan, Mesh) else scan
-    far, seen, stretch = fit.uncovered, float(fit.seen.mean()), share_stretched(template, fit.mesh)
+    far, seen, stretch = fit.uncovered, fit.measured, share_stretched(template, fit.mesh)
     off = fit.landmark_rms > HAND * size(template)
     # Both uncovered and stretched above 0.05: with left and right exchanged they are 0.13 and 0.10.
     # Less than 0.2 with data: most of the template is extrapolated. Shins and feet give 0.15, one view 0.26 to 0.46,
@@ -271,7 +277,8 @@ def measure_fit(inputs: RegistrationProblem, fit: Fit, scan: Mesh | np.ndarray) 
         landmark_rms = float(np.sqrt(np.mean(apart**2)))
     return Registration(
         mesh=body, distances=np.where(seen, data.distances, np.nan), seen=seen,
-        rms=float(np.sqrt(np.mean(data.distances[seen] ** 2))) if seen.any() else np.nan, landmark_rms=landmark_rms,
+        rms=float(np.sqrt(body.vertex_areas[seen] @ data.distances[seen]**2 / body.vertex_areas[seen].sum()))
+        if seen.any() else np.nan, landmark_rms=landmark_rms,
         converged=bool(fit.moved <= 0.001 * size and seen.any()), iterations=fit.iterations, energies=fit.energies,
         inverted=int(find_inverted_triangles(inputs.template, fit.x).sum()), confidence=data.confidence,
         uncovered=share_uncovered(scan, body, 0.01 * size))
@@ -331,10 +338,11 @@ def evidence(deformed: Mesh, target: Target, reach: float, scale: float) -> Evid
 
 
 def share_uncovered(scan: Mesh | np.ndarray, registered: Mesh, far: float, samples: int = 5000) -> float:
-    """Compute the share of the points of a scan that lie further than `far` (metres) from a mesh."""
+    """Compute the share of a scanned surface that lies further than `far` (metres) from a mesh."""
     points = scan.vertices if isinstance(scan, Mesh) else scan
-    points = points[:: max(1, len(points) // samples)]
-    return float((Surface(registered).closest(points).distances > far).mean())
+    every = slice(None, None, max(1, len(points) // samples))
+    off = Surface(registered).closest(points[every]).distances > far
+    return float(np.average(off, weights=point_areas(scan)[every]))
 
 
 def share_stretched(template: Mesh, registered: Mesh, factor: float = 2.0) -> float:
