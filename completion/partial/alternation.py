@@ -16,6 +16,7 @@ import numpy as np
 from scipy.sparse import csr_array
 
 from model.body import BodyModel
+from model.fitting.free_surface import FreeSurface
 from model.fitting.rounds import SETTLED, Solved
 from model.fitting.scan_fit import EVIDENCE, FINAL_REACH, REACH, ScanFit, Skin
 from model.gradients import edges
@@ -25,7 +26,6 @@ from scanprep.geometry import rotations
 from scanprep.geometry.mesh import Mesh
 from scanprep.skeleton.tree import Skeleton
 
-from .free_surface import FreeSurface
 from .settings import CompletionConfig
 
 MORE = 3                             # times the rounds of the joint method: each block moves only a little in a round

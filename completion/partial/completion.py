@@ -11,6 +11,7 @@ import numpy as np
 from model.body import BodyModel
 from model.fitting.bodies import as_body
 from model.fitting.free_space import free_space_violation
+from model.fitting.free_surface import distance_to, free_surface
 from model.fitting.limbs import with_limbs
 from model.fitting.rounds import solve_jointly
 from model.fitting.scan import Scan
@@ -30,7 +31,6 @@ from scanprep.threads import one_thread
 
 from .alternation import turns_of
 from .confidence import distance_to_seen, estimate_error, posterior_error, probability_within
-from .free_surface import distance_to, free_surface
 from .inputs import prepare_in_metres
 from .scale import ScaledBody
 from .settings import CompletionConfig
@@ -204,7 +204,7 @@ def complete(body: BodyModel | Subject, scan: Scan, landmarks: tuple[np.ndarray,
     # let the surface follow the scan where it has data, and lift the soles onto the floor
     predicted = person.template.with_vertices(person.vertices(x))
     cloud = fit.without_ignored(inputs.cloud, predicted)
-    completed, seen, used, rms = free_surface(predicted, cloud, config)   # [SCAPE] Eq. 10, over Y
+    completed, seen, used, rms = free_surface(predicted, cloud, config.surface_weight)   # [SCAPE] Eq. 10, over Y
     foot = foot_of_vertex(predicted, person.skeleton)
     standing = put_on_floor(predicted, completed, foot, cloud.points, cloud.normals)
     completed = completed if standing is None else completed.with_vertices(standing.vertices)

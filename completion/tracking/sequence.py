@@ -9,6 +9,7 @@ import numpy as np
 
 from model.body import BodyModel
 from model.fitting.bodies import FixedBody, ShapedBody, as_body
+from model.fitting.free_surface import free_surface
 from model.fitting.scan import ScanPoints
 from model.linear import Subject
 from scanprep.geometry.mesh import Mesh
@@ -17,7 +18,6 @@ from scanprep.threads import one_thread
 
 from ..motion import Motion, Progress
 from ..partial.completion import complete
-from ..partial.free_surface import free_surface
 from ..smoothing import inertia, predict, smooth_frames
 from .frame_fit import FrameFit, Refined, fit_shared_shape, spread_poses
 from .frames import Frame, frame_views, prepare_frame
@@ -232,7 +232,8 @@ class BodyTracker:
         [SCAPE] Eq. 10
         """
         mesh = self._mesh(frame.x)
-        return mesh if frame.cloud is None or not frame.found else free_surface(mesh, frame.cloud, self.config.start)[0]
+        return mesh if frame.cloud is None or not frame.found else free_surface(
+            mesh, frame.cloud, self.config.start.surface_weight)[0]
 
     def _begin(self, cloud: ScanPoints) -> Refined:
         """Fit the first frame that shows something: complete it, then refine."""

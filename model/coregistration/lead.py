@@ -13,9 +13,12 @@ from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.surface import Surface
+from scanprep.judgement import extent, unit_problem
+from scanprep.registration.nonrigid import covers
 from scanprep.registration.person import PersonParts, average_person
 from scanprep.skeleton.tree import Skeleton
 from scanprep.synthetic.anatomy import PARENTS, PARTS
@@ -92,6 +95,22 @@ def model_lead(template: Mesh, through: str, progress: Callable[[int, int], None
     corners = laid.faces[place.faces]
     off = np.einsum("nd,nd->n", template.vertices - place.points, normals_at(laid, corners, place.bary))
     return ModelLead(name, corners, place.bary, off, _parts(model, laid, template))
+
+
+def person_on(scan: Mesh | np.ndarray) -> tuple[Mesh, dict[str, int]] | None:
+    """Find the built-in people's body on a scan, see `scanprep.registration.lead.find_person`."""
+    model = model_at(BUILT_IN)
+    points = scan.vertices if isinstance(scan, Mesh) else scan
+    # the search takes seconds: ask it only where the scan is as large as people are
+    if unit_problem(extent(points), extent(model.template.vertices), "the scan is"):
+        return None
+    for body in find_bodies(model, scan):
+        size = float(np.sqrt(body.face_areas.sum()))
+        # the scan lies on the body, but for clothes and hair, and shows most of it
+        shown = cKDTree(points).query(body.vertices)[0] < 0.03 * size
+        if covers(body, scan, size) and body.share_of_area(shown) > 0.7:
+            return body, dict(model.info["landmarks"])
+    return None
 
 
 def _in_same_triangles(model: BodyModel, template: Mesh) -> Mesh | None:

@@ -213,9 +213,11 @@ def _split(scan: View, name: str) -> tuple[np.ndarray, np.ndarray | None]:
 
 
 def _concatenate(parts: Sequence[ScanPoints]) -> ScanPoints:
-    names = ("points", "normals", "border", "view", "index", "areas")
-    joined = {name: np.concatenate([getattr(part, name) for part in parts]) for name in names}
-    return ScanPoints(**joined, spacing=float(np.median([part.spacing for part in parts])))
+    points, normals, border, view, index, areas = (
+        np.concatenate([getattr(part, name) for part in parts])
+        for name in ("points", "normals", "border", "view", "index", "areas"))
+    spacing = float(np.median([part.spacing for part in parts]))
+    return ScanPoints(points, normals, border, spacing, view, index, areas)
 
 
 def _without_inner_borders(scan: ScanPoints) -> ScanPoints:

@@ -16,6 +16,7 @@ from scanprep.threads import one_thread
 
 from ..body import BodyModel
 from .bodies import FixedBody, as_body
+from .free_surface import free_surface
 from .limbs import with_limbs
 from .rounds import solve_jointly
 from .scan_fit import ScanFit, prepare_scan_fit
@@ -73,7 +74,7 @@ def lay_model(model: BodyModel, template: Mesh, progress: Callable[[int, int], N
 
 
 def find_bodies(model: BodyModel, scan: Mesh | np.ndarray, landmarks: Landmarks | None = None) -> Iterator[Mesh]:
-    """Yield likely bodies of a model on a scan, each computed on demand.
+    """Yield likely bodies of a model on a scan, each bent onto it where there are data, and computed on demand.
 
     First comes the best of the typical poses. Then come the best after re-initialisation of limbs, and another body
     that explains the scan nearly as well, where they differ.
@@ -88,32 +89,41 @@ def find_bodies(model: BodyModel, scan: Mesh | np.ndarray, landmarks: Landmarks 
         Few vertices of the model and where they are on the scan.
     """
     body, size = as_body(model), float(np.sqrt(model.template.face_areas.sum()))
-    fit, coarse, starts = _search(body, scan, landmarks or NO_LANDMARKS)
+    fit, coarse, starts, factor = _search(body, scan, landmarks or NO_LANDMARKS)
 
     def mesh_of(x: np.ndarray) -> Mesh:
-        """Compute the body of unknowns (P,) at its own size."""
+        """Compute the predicted body of unknowns (P,) at its own size."""
         return model.template.with_vertices(body.vertices(fit.body.in_metres(x)[0]))
 
-    first = mesh_of(_solve(fit, coarse, starts[0]))
+    def bend(x: np.ndarray) -> Mesh:
+        """Let the surface of the body follow the scan; lengths there are those of the fit."""
+        followed, *_ = free_surface(fit.mesh(x), fit.cloud)              # [SCAPE] Eq. 10, over Y
+        return followed.with_vertices(followed.vertices / factor)
+
+    best = _solve(fit, coarse, starts[0])
+    first = mesh_of(best)
     # a body with a limb in the wrong place leaves scan points uncovered: skip it
     lost = share_uncovered(scan, first, FAR * size) > LOST
     if not lost:
-        yield first
+        yield bend(best)
     for x in _solve_with_limbs(fit, coarse, starts):
-        other = mesh_of(x)
-        if lost or np.linalg.norm(other.vertices - first.vertices, axis=1).max() > ALIKE * size:
-            yield other
+        if lost or np.linalg.norm(mesh_of(x).vertices - first.vertices, axis=1).max() > ALIKE * size:
+            yield bend(x)
 
 
 @one_thread()
-def _search(body: FixedBody, scan: Mesh | np.ndarray, landmarks: Landmarks) -> tuple[ScanFit, ScanFit, np.ndarray]:
-    """Prepare the fit of a scan, the same with few vertices, and the unknowns (n, P) of likely bodies, best first."""
-    fit, _ = prepare_scan_fit(body, scan, *landmarks, ScanFitConfig())
+def _search(body: FixedBody, scan: Mesh | np.ndarray, landmarks: Landmarks
+            ) -> tuple[ScanFit, ScanFit, np.ndarray, float]:
+    """Prepare the fit of a scan, the same with few vertices, and the unknowns (n, P) of likely bodies, best first.
+
+    Also return the factor by which lengths of the fit are larger than those of the scan.
+    """
+    fit, factor = prepare_scan_fit(body, scan, *landmarks, ScanFitConfig())
     few = fit.few()
     starts = first_starts(fit, few)
     if len(landmarks[0]) >= 3:                 # few landmarks determine little: also try starts without them
         starts = np.concatenate([starts, from_nothing(few)])
-    return fit, few, best_starts(few, starts)
+    return fit, few, best_starts(few, starts), factor
 
 
 @one_thread()

@@ -1,8 +1,8 @@
 """Initialisation of a registration by a body model: it finds the body on a scan and proposes the template's vertices.
 
 The package `model` does this with the built-in people or with your own model, and learns a model from a set. It is
-found by the entry points `model` and `learn` of the group `scapekit.leads`, because nothing in `scanprep` may import
-it.
+found by the entry points `model`, `learn` and `person` of the group `scapekit.leads`, because nothing in `scanprep` may
+import it.
 """
 from __future__ import annotations
 
@@ -81,6 +81,23 @@ def learn_model(template: Mesh, skeleton: Skeleton, poses: np.ndarray, shapes: n
         Meshes that a model cannot be learned from, with the reason.
     """
     _load_entry_point("learn", "a model of this set")(template, skeleton, poses, shapes, path)
+
+
+def find_person(scan: Mesh | np.ndarray) -> tuple[Mesh, dict[str, int]] | None:
+    """Find the person on a scan with the built-in people.
+
+    Parameters
+    ----------
+    scan : Mesh or (n, 3) float, metres
+        A scan of the whole body.
+
+    Returns
+    -------
+    (Mesh, dict of str to int) or None
+        The body of the built-in people that lies on the scan, and their landmarks as its vertices. None where the scan
+        shows something else, or a part of a body only.
+    """
+    return _load_entry_point("person", "a person's body")(scan)
 
 
 def _load_entry_point(name: str, wanted: str) -> Callable[..., Any]:

@@ -184,7 +184,8 @@ def register(template: Mesh, scan: Mesh | np.ndarray, landmarks: tuple[np.ndarra
         Hints, of which some may be wrong. Their pull is soft, and weaker for hints far from their target.
     start : (4, 4) or (N, 3) float, metres, optional
         A transform that brings the template near the scan; by default found from landmarks, else by ICP. ICP can fail
-        on a partial scan. Or approximate vertices, for example of a body model; then only the last stages run.
+        on a partial scan. Or approximate vertices, for example of a body model; then only the last stages run, and
+        only the final fit where they already cover the scan.
 
     Returns
     -------
@@ -214,11 +215,24 @@ def register(template: Mesh, scan: Mesh | np.ndarray, landmarks: tuple[np.ndarra
     # check the inputs; describe every point by position, normal and path lengths to landmarks
     inputs = prepare_problem(template, scan, landmarks, correspondences)
     begin = initial_transform(inputs) if start is None else _check_start(template, start)
-    # bring the template near the scan, from stiff to soft; then fit the surface down to the noise
-    fit = METHODS[config.method](inputs, begin, config, lambda done, total: report_progress(90 * done // total, 100))
+    # bring the template near the scan, from stiff to soft, unless it starts there; then fit the surface to the noise
+    if begin.shape != (4, 4) and covers(template.with_vertices(begin), scan, inputs.size):
+        fit = Fit(begin)
+    else:
+        fit = METHODS[config.method](inputs, begin, config,
+                                     lambda done, total: report_progress(90 * done // total, 100))
     fit = snap_to_surface(inputs, fit, config)
     report_progress(100, 100)
     return measure_fit(inputs, fit, scan)
+
+
+def covers(body: Mesh, scan: Mesh | np.ndarray, size: float) -> bool:
+    """Tell whether a body already lies on a scan: a coarse registration could only spoil its fingers.
+
+    At most 10% of the scan is farther off than 0.01 of the `size`: 0.0% of naked people, 3 to 8% of long hair, 14 to
+    28% of skirts. From there a graph, whose nodes are wider than fingers, made hands 15 to 28 mm worse.
+    """
+    return share_uncovered(scan, body, 0.01 * size) <= 0.1
 
 
 def _check_start(template: Mesh, start: np.ndarray) -> np.ndarray:

@@ -35,6 +35,7 @@ from ..geometry.landmarks import landmarks_beside, read_landmark_vertices, read_
 from ..geometry.mesh import Mesh, template_problem
 from ..judgement import Judgement
 from ..ranges import Faces
+from ..registration.lead import find_person
 from ..repair.hole_filling import FillConfig, FilledHole, fill_holes, fill_report, filling_judgement
 from ..repair.manifold import repair
 from ..words import number_of
@@ -83,9 +84,15 @@ def template(scans: ScansArg, output: Output, faces: Faces = 14000, landmarks: P
         surface = scan if isinstance(scan, Mesh) else scan.points
         places = {} if path is None else read_landmarks(path, surface, unit)
         with bar("making the template") as progress:
+            person = find_person(surface)
             done = template_of_scan(scan, faces, landmarks=np.array(list(places.values())) if places else None,
-                                    progress=progress)
-        made, notes, doubts = done.mesh, done.notes, list(done.doubts)
+                                    progress=progress, person=None if person is None else person[0])
+        if person is not None and not places:
+            body, named = person
+            places = {name: body.vertices[vertex] for name, vertex in named.items()}
+            notes = ("the landmarks are those of the built-in people, who lie on the scan: some centimetres from where "
+                     "you would click",)
+        made, notes, doubts = done.mesh, (*done.notes, *notes), list(done.doubts)
         rows = [Metric("files", len(paths)),
                 Metric("filled, where nothing was scanned", 100 * done.filled, "% of the surface")]
         if done.balance is not None:

@@ -5,6 +5,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
+import igl
 import numpy as np
 from scipy.spatial import cKDTree
 
@@ -17,6 +18,8 @@ from ..geometry.mesh import Mesh, check_template, template_problem
 from ..geometry.remeshing import improve_triangles, smooth_taubin
 from ..geometry.surface import Surface
 from ..ranges import Settings
+from ..registration.nonrigid import share_uncovered
+from ..repair.graft import graft
 from ..repair.hole_filling import FillConfig, close
 from ..repair.manifold import drop_thin, repair
 from ..skeleton.symmetry import find_symmetry
@@ -66,20 +69,24 @@ class MadeTemplate:
     filled: float                       # share of the surface without scan data
     handles: int                        # topological handles, as between thighs that touch
     balance: float | None               # share of the triangles on the left side; None without symmetry
+    lost: float = 0.0                   # share of the scanned surface that is more than 8 mm off the template
 
     @property
     def doubts(self) -> list[str]:
-        """What needs a look before scans are registered with it: more than 5% filled, or handles."""
+        """What needs a look before scans are registered with it: much filled or lost, or handles."""
         return [*([f"{100 * self.filled:.0f}% of the surface is filled, nothing was scanned there"]
                   if self.filled > 0.05 else []),
+                # a finger has 0.4% of a person's surface
+                *([f"{100 * self.lost:.1f}% of the scan is more than 8 mm off the template: thin parts, as fingers, "
+                   "were lost, so ask for more --faces"] if self.lost > 0.004 else []),
                 *([f"the surface is joined to itself in {number_of(self.handles, 'place')}: thighs, armpits or "
                    "fingers that touch"]
                   if self.handles else [])]
 
 
 def template_of_scan(scan: Mesh | PointCloud, faces: int = 14000, config: TemplateConfig | None = None,
-                     landmarks: np.ndarray | None = None, progress: Callable[[int, int], None] | None = None
-                     ) -> MadeTemplate:
+                     landmarks: np.ndarray | None = None, progress: Callable[[int, int], None] | None = None,
+                     person: Mesh | None = None) -> MadeTemplate:
     """Make a closed manifold mesh from one scan of a whole body: clean, repair, fill, decimate.
 
     Parameters
@@ -94,6 +101,8 @@ def template_of_scan(scan: Mesh | PointCloud, faces: int = 14000, config: Templa
         Points on the body, if it is not the largest piece of the scan.
     progress : callable, optional
         Called as progress(done, total).
+    person : Mesh, metres, optional
+        A body that lies on the scan. What the scan lacks of it, such as a finger tip, is taken from it.
 
     Returns
     -------
@@ -123,8 +132,8 @@ def template_of_scan(scan: Mesh | PointCloud, faces: int = 14000, config: Templa
         normals = None if scan.normals is None else scan.normals[kept]
         mesh = mesh_of_cloud(PointCloud(points[kept], normals))
         notes.append("points without triangles were meshed")
-    made = _finish(mesh, faces, config, progress, "the scan", landmarks)
-    return replace(made, notes=(*notes, *made.notes))
+    made = _finish(mesh, faces, config, progress, "the scan", landmarks, person)
+    return replace(made, notes=(*notes, *made.notes), lost=share_uncovered(mesh, made.mesh, 0.008))
 
 
 def views_without_cameras(views: Sequence[Mesh | PointCloud]) -> PointCloud:
@@ -155,14 +164,24 @@ def views_without_cameras(views: Sequence[Mesh | PointCloud]) -> PointCloud:
 
 
 def _finish(mesh: Mesh, faces: int, config: TemplateConfig, progress: Callable[[int, int], None] | None, what: str,
-            landmarks: np.ndarray | None = None) -> MadeTemplate:
-    """Smooth, fill and decimate an open surface; vertices at landmarks (L, 3), such as fingertips, stay."""
+            landmarks: np.ndarray | None = None, person: Mesh | None = None) -> MadeTemplate:
+    """Smooth, fill and decimate an open surface; vertices at landmarks (L, 3), such as fingertips, stay.
+
+    What the surface lacks of a `person` is taken from there.
+    """
     report_progress, notes = progress or (lambda done, total: None), list[str]()
     report_progress(1, 4)
     mesh = repair(mesh)
     # the same smoothing length as on merged views: on coarse scans as many rounds would round off fingers
     rounds = min(config.smoothing, round(config.smoothing * (config.merge.voxel / mesh.mean_edge)**2))
     scanned = mesh = smooth_taubin(mesh, rounds)                        # smooth borders give fair patches
+    if person is not None:
+        # triangles of a sixteenth, as fine as those of a scan
+        fine = Mesh(*igl.upsample(np.array(person.vertices), np.array(person.faces), 2))
+        mesh, pieces = graft(mesh, close(mesh, config.fill), fine)
+        if pieces:
+            notes.append(f"{number_of(pieces, 'piece')} that the scan lacks, such as finger tips or toes, "
+                         f"{'is' if pieces == 1 else 'are'} of the built-in people's body")
     holes = len(mesh.boundary_loops)
     if holes:
         notes.append(f"{number_of(holes, 'hole was', 'holes were')} filled")

@@ -4,13 +4,12 @@ from __future__ import annotations
 import numpy as np
 from scipy.sparse import coo_array, csc_array, csr_array
 
-from model.fitting.scan import ScanPoints
-from model.fitting.scan_fit import MIN_COSINE
 from scanprep.geometry import sparse
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.surface import Surface
 
-from .settings import CompletionConfig
+from .scan import ScanPoints
+from .scan_fit import MIN_COSINE
 
 NEAR, ROUNDS = 0.03, 4              # metres: largest distance of a match; rounds of matching
 
@@ -63,9 +62,11 @@ def edge_matrix(faces: np.ndarray, count: int) -> csc_array:
     return csc_array(G.T @ G)
 
 
-def free_surface(predicted: Mesh, cloud: ScanPoints, config: CompletionConfig
+def free_surface(predicted: Mesh, cloud: ScanPoints, surface_weight: float = 1.0
                  ) -> tuple[Mesh, np.ndarray, np.ndarray, float]:
     """Return the completed mesh, its observed vertices (N,), the used scan points (n,) and their RMS distance, metres.
+
+    `surface_weight` is w_Z: how strongly each measured point attracts the surface.
 
     [SCAPE] Eq. 10
     """
@@ -78,7 +79,7 @@ def free_surface(predicted: Mesh, cloud: ScanPoints, config: CompletionConfig
         used = agree & (closest.distances < NEAR)
         weights = _rows(predicted, closest.faces[used], closest.bary[used])
         mesh = predicted.with_vertices(solver.solve(predicted.vertices, weights, cloud.points[used],
-                                                    np.full(used.sum(), config.surface_weight)))
+                                                    np.full(used.sum(), surface_weight)))
     # a vertex was observed when a used point lies on one of its triangles
     seen = np.zeros(len(predicted.vertices), dtype=bool)
     seen[predicted.faces[closest.faces[used]]] = True

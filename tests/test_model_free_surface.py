@@ -3,7 +3,7 @@ import pytest
 from completion_bodies import worm_with_prior
 from scipy.sparse import csr_array
 
-from completion.partial.free_surface import FreeSurface, edge_matrix
+from model.fitting.free_surface import FreeSurface, edge_matrix
 from model.gradients import edges
 
 RNG = np.random.default_rng(0)
