@@ -244,7 +244,9 @@ def test_clutter_beside_the_body_changes_little_and_noise_is_told():
     apart = [np.linalg.norm(found.mesh.vertices - x, axis=1).mean() for found in (clean, cluttered, noisy)]
     assert apart[0] < 0.008 and apart[1] < 0.012 and apart[2] < 0.014
     assert noisy.rms > 2 * clean.rms
-    assert clean.uncovered < 0.005 and cluttered.uncovered == pytest.approx(1500 / 6500, abs=0.01)
+    # the board has 0.8 x 0.6 m, however few of the points lie on it
+    share = 0.48 / (0.48 + truth.face_areas.sum())
+    assert clean.uncovered < 0.005 and cluttered.uncovered == pytest.approx(share, abs=0.03)
 
 
 # ---- rotations around vertices ------------------------------------------------------------------------------
