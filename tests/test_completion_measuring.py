@@ -7,8 +7,11 @@ import numpy as np
 import pytest
 import trimesh
 from people_bodies import kept, small_people
+from quiet_pictures import render
+from scene_reader import scenes_of
 
 from completion.__main__ import main
+from completion.measuring.page import measures_page
 from completion.partial.completion import Completion, save_completion
 from model import find_tapes, measure
 from model.measurement.catalogue import CATALOGUE
@@ -16,6 +19,7 @@ from model.measurement.survey import ordinal, percentiles
 from scanprep import Mesh, RegisteredSet, write_mesh
 from scanprep.geometry.landmark_names import landmark_name, translate_landmarks
 from scanprep.judgement import Judgement
+from scanprep.pictures import scene
 from scanprep.synthetic.people import BodyShape, SyntheticPerson
 
 
@@ -64,6 +68,20 @@ def test_a_folder_and_betas_with_their_model(folder, tmp_path, capsys):
     assert "4 bodies, measured" in page and "back waist length, ISO 8559-1" in page
     report = (tmp_path / "all.csv.report.json").read_text(encoding="utf-8")
     assert "NaN" not in report and json.loads(report)["judgement"]["verdict"] == "good"
+
+
+def test_every_body_is_on_the_page(monkeypatch):
+    """Three in a figure, six in a table; of very many all are in the tables."""
+    monkeypatch.setattr(scene, "render", render)
+    model = small_people()
+    tapes = find_tapes(model.template, model.info["landmarks"])
+    read = measure(model.template.vertices, tapes)
+    for count, drawn in ((10, [3, 3, 3, 1]), (26, [3] * 8)):
+        names = [f"body {k}" for k in range(count)]
+        page = measures_page(names, [model.template.vertices] * count, [read] * count, tapes).html()
+        assert [len(scene.header["panes"]) for scene in scenes_of(page)] == drawn
+        assert all(page.count(f"<th>{name}</th>") == 1 for name in names)
+        assert ("Drawn are the first 24 of 26 bodies." in page) == (count == 26)
 
 
 TAPES = ("stature", "chest_girth", "hip_girth", "thigh_girth_left", "calf_girth_right", "foot_length_left")

@@ -204,3 +204,12 @@ def test_a_result_is_mended_in_the_browser_and_run_again(place, new_page):
     written = json.loads((place / "out" / "report.json").read_text())
     assert written["settings"]["layout"] == call.layout and not written["failures"]
     assert "scape view" in (place / "out" / "report.html").read_text()
+
+
+def test_a_built_in_model_is_kept_by_its_name(tmp_path, monkeypatch):
+    """The call of `scape mosh walk.c3d -m people`, mended from any folder."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "walk.c3d").write_bytes(b"")
+    MoshCall((Path("walk.c3d"),), (Path("people"),), layout="cmu41").write(tmp_path)
+    call = MoshCall.read(tmp_path)
+    assert call.markers == (tmp_path / "walk.c3d",) and call.model == (Path("people"),) and call.layout == "cmu41"

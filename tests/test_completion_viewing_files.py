@@ -2,21 +2,29 @@
 import json
 import warnings
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 from browser import wait_until
 from completion_bodies import worm_with_prior
+from people_bodies import small_people
+from readme_user import of_a_user
 from viewing_apps import a_motion, app_of, ask, write_files
 
+from completion import MarkerSequence, Motion, write_markers
 from completion.__main__ import main
 from completion.partial.completion import Completion, save_completion
+from completion.viewing import files as reading
 from completion.viewing.arrangement import arrange_side_by_side
 from completion.viewing.contents import Stance, of_mesh
 from completion.viewing.notebook import view
+from model import files as files_of_models
+from model import load_model
 from scanprep import RegisteredSet, write_mesh
 from scanprep.geometry import rotations
 from scanprep.geometry.mesh import Mesh
+from scanprep.synthetic.people import MARKERS, SyntheticPerson, synthesise_walk
 
 
 @pytest.fixture(scope="module")
@@ -198,3 +206,41 @@ def test_things_at_one_place_are_seen_from_one_side(model):
     cameras, _ = arrange_side_by_side([body, standing(40), standing(170), standing(40, 5.0)])
     apart = [np.degrees(np.arccos(np.clip(one.axes[2] @ cameras[0].axes[2], -1, 1))) for one in cameras]
     assert apart[1] < 1e-3 and apart[2] > 100 and 30 < apart[3] < 50
+
+
+@pytest.mark.parametrize("name", ["people", "people-fingers"])
+def test_results_of_built_in_models_open(name, tmp_path, monkeypatch):
+    """The report of a command without -m names its model; so does -m, wherever one is."""
+    monkeypatch.chdir(tmp_path)
+    parts = len(load_model(name).skeleton.parents)
+    (tmp_path / "out").mkdir()
+    Motion(np.zeros((3, parts, 3)), np.zeros((3, 3)), np.zeros(2), 30.0, np.zeros((3, 0)), ()).save(
+        tmp_path / "out" / "motion.npz")
+    (tmp_path / "out" / "report.json").write_text(json.dumps({"settings": {"model": name}}))
+    assert app_of(tmp_path, "out").shown == [0]
+    (tmp_path / "out" / "report.json").unlink()
+    assert app_of(tmp_path, "out", model=Path(name)).shown == [0]
+
+
+@pytest.mark.slow
+def test_results_of_commands_without_a_model_open_in_another_folder(tmp_path, monkeypatch):
+    person, (poses, trans) = SyntheticPerson(), synthesise_walk(12, 30.0)
+    bodies = [person.mesh.with_vertices(person.in_pose(*each)) for each in zip(poses, trans, strict=True)]
+    at = list(MARKERS.values())
+    markers = np.stack([body.vertices[at] + 0.0095 * body.vertex_normals[at] for body in bodies])
+    with of_a_user(tmp_path):
+        write_markers(Path("walk.c3d"), MarkerSequence(markers, tuple(MARKERS), 30.0))
+        for number in range(2):
+            write_mesh(Path("frames") / f"{number}.ply", small_people().template)
+        for words in ("mosh walk.c3d", "animate walk.c3d", "track frames", "complete frames/0.ply"):
+            assert main([*words.split(), "-o", f"out/{words.split()[0]}"]) == 0
+        (tmp_path / "out").rename(tmp_path / "moved")
+        (tmp_path / "elsewhere").mkdir()
+        monkeypatch.chdir(tmp_path / "elsewhere")
+        monkeypatch.setattr(reading, "load_model", files_of_models.load_model)
+        for command in ("mosh", "animate", "track", "complete"):
+            app = app_of(tmp_path / "moved", command)
+            assert app.shown == [0] and not app.problems, command
+        app = app_of(tmp_path, "moved")
+        ask(app, "show", entries=[0, 1, 2, 3])
+        assert app.shown == [0, 1, 2, 3] and not app.problems

@@ -19,6 +19,7 @@ from completion.demo import chain
 from completion.demo import figures as measuring
 from completion.demo.chain import QUICK, Demo, DemoConfig
 from completion.demo.cli import demo
+from completion.viewing.files import Files
 from model import load_model
 from scanprep import RegisteredSet, console
 from scanprep.batch.opening import workspace
@@ -27,6 +28,7 @@ from scanprep.decimation.registered_set import decimate_set
 from scanprep.geometry.files import read_mesh, write_mesh
 from scanprep.geometry.mesh import template_problem
 from scanprep.geometry.surface import Surface
+from scanprep.pipeline.mend import MendApp
 from scanprep.pipeline.prepare import PrepareConfig
 from scanprep.skeleton.find import find_skeleton
 from scanprep.surfaces.cli import template
@@ -142,6 +144,14 @@ def test_outputs_are_whole(demo_folder):
     assert model.n_betas == 3 and model.info["landmarks"]          # of four bodies
     motion = Motion.load(demo_folder / "animation" / "motion.npz")
     assert len(motion.poses) == 66 and np.isfinite(motion.poses).all()
+
+
+def test_its_motion_opens_and_its_set_can_be_mended(demo_folder):
+    """By themselves, as those of `scape animate` and `scape prep run`; nothing has to be registered again."""
+    entry, = Files((demo_folder / "animation",)).entries()
+    assert entry.load().shapes
+    app = MendApp(demo_folder / "set")
+    assert len(app.scans) == 11 and not app.changed
 
 
 def test_page_stands_alone(demo_folder):

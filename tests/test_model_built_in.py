@@ -13,6 +13,7 @@ from completion.motion import Motion
 from completion.viewing.kinds import model_of_report
 from model import fit_pose, load_model
 from model.built_in import STORED, load_built_in_model, load_fingered_model, pack_coefficients, unpack_coefficients
+from model.files import LOADERS
 from scanprep.geometry import storage
 from scanprep.synthetic.landmarks import landmarks, markers
 from scanprep.synthetic.people import BodyShape, SyntheticPerson, random_pose
@@ -111,14 +112,27 @@ def test_a_file_of_the_old_people_works_and_is_told_to_be_old(tmp_path):
 
 
 @pytest.mark.parametrize(("named", "known"), [
-    ("people", True), ("model.npz", True), ("gone.npz", False),
+    ("people", True), ("people-fingers", True), ("model.npz", True), ("gone.npz", False),
     ("synthetic people, built 2026-01-01, cached at /home/me/.cache/scapekit/synthetic-people-6cc7.npz", False)])
 def test_models_that_reports_name(tmp_path, monkeypatch, named, known):
     """The old built-in people are gone, and so are their cached files: their betas mean nothing here."""
     monkeypatch.chdir(tmp_path)
     Path("model.npz").write_text("")
     Path("report.json").write_text(json.dumps({"settings": {"model": named}}))
-    assert model_of_report(Path("report.json")) == (Path(named) if known else None)
+    found = model_of_report(Path("report.json"))
+    assert found == (None if not known else Path(named) if named in LOADERS else Path(named).absolute())
+
+
+def test_a_model_that_was_moved_with_its_results_is_found(tmp_path, monkeypatch):
+    """The report names it as it was named on the command line, relative to where that was given."""
+    (tmp_path / "study" / "out" / "ann").mkdir(parents=True)
+    for folder in ("study", "elsewhere"):                          # that of another study is where we are now
+        (tmp_path / folder).mkdir(exist_ok=True)
+        (tmp_path / folder / "model.npz").write_text("")
+    report = tmp_path / "study" / "out" / "ann" / "report.json"
+    report.write_text(json.dumps({"settings": {"model": "model.npz"}}))
+    monkeypatch.chdir(tmp_path / "elsewhere")
+    assert model_of_report(report) == tmp_path / "study" / "model.npz"
 
 
 def test_fingers_bend_in_their_bones():

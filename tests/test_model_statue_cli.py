@@ -8,6 +8,7 @@ from PIL import Image
 from trimesh.remesh import subdivide_to_size
 
 from completion.__main__ import main
+from completion.viewing.kinds import model_of_report
 from model import load_model
 from model.statue import report
 from model.statue.commands import judge_statue, read_scan
@@ -165,6 +166,9 @@ def test_a_walk_moves_the_statue(made, tmp_path):
     assert figures(tmp_path / "again" / "report.json")["rate"] == 24.0
     again = read_mesh(tmp_path / "again" / "meshes" / "00003.ply")
     assert np.abs(again.vertices - body.vertices).max() < 1e-6
+    # and `scape view` finds the model of it, wherever the folder is
+    (tmp_path / "again").rename(tmp_path / "moved")
+    assert len(load_model(model_of_report(tmp_path / "moved" / "report.json")).skeleton.parents) == 17
 
 
 def test_the_statue_is_a_body_model_that_markers_can_drive(made):

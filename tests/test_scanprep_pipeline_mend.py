@@ -10,12 +10,14 @@ from scanprep import RegisteredSet, read_mesh, write_landmarks, write_mesh
 from scanprep.batch.calls import RUN
 from scanprep.batch.opening import lock_output, workspace
 from scanprep.batch.ownership import HOME
+from scanprep.geometry.landmark_names import TEN
 from scanprep.geometry.landmarks import read_landmarks
 from scanprep.geometry.storage import StorageError
 from scanprep.pipeline.again import Call
 from scanprep.pipeline.cli import carry_out
 from scanprep.pipeline.mend import MendApp
-from scanprep.viewer.clicked import KEPT
+from scanprep.viewer import pick
+from scanprep.viewer.clicked import KEPT, Clicked
 from scanprep.viewer.messages import Message
 from scanprep.viewer.server import Server
 
@@ -115,6 +117,35 @@ def test_exchanged_landmarks_are_mended_and_only_that_scan_is_registered(place):
     assert {m.name: m.value for m in done.metrics}["of them in this run"] == 0
 
 
+def test_only_what_has_changed_is_registered_again(place):
+    """Also what was changed before the page was opened; a click that was taken back is no change."""
+    app = MendApp(place / "set", ENDING)
+    state = app.greet()[-1].fields
+    assert state["changed"] == [] and not state["template_changed"] and not state["outdated"]
+    with pytest.raises(ValueError, match="nothing has changed"):
+        sent(app, "register")
+    sent(app, "remove", pane=1, name="top")
+    assert app.greet()[-1].fields["changed"] == ["body1"] and app.greet()[-1].fields["outdated"]
+    sent(app, "undo")
+    assert app.greet()[-1].fields["changed"] == []
+    sent(app, "open", scan=1)
+    sent(app, "remove", pane=1, name="top")
+    write_mesh(place / "scans" / "body9.ply", ball())
+    again = MendApp(place / "set", ENDING).greet()[-1].fields
+    assert again["changed"] == [app.scan_names[1], "body9"] and not again["outdated"]
+    sent(app, "remove", pane=0, name="top")
+    assert app.greet()[-1].fields["template_changed"]
+
+
+def test_where_nobody_named_a_landmark_those_of_people_are_offered(place):
+    """A set that was made without any: the landmarks of template and scans are clicked one after the other."""
+    for path in place.rglob("*landmarks.json"):
+        path.write_text("{}")
+    app = MendApp(place / "set", ENDING)
+    assert app.names == TEN and app.building and app.chosen == TEN[0]
+    assert pick.PickApp(Clicked.load(place / "set" / "template.ply", ENDING), [], TEN).names == TEN
+
+
 def test_another_run_on_the_set_is_told_and_nothing_is_lost(place):
     app = MendApp(place / "set", ENDING)
     mend(app, place)
@@ -147,12 +178,14 @@ def test_a_set_is_mended_in_the_browser(new_page, place):
         page.goto(server.opening())
         wait_until(page, READY)
         assert page.locator(".sk-verdict").get_attribute("data-verdict") in ("check", "failed")
+        again = page.locator("button", has_text="register again")
+        assert again.is_disabled()
         take_away(page, WRONG)
         assert "changed since" in page.locator(".sk-verdict strong").inner_text()
-        page.locator("button", has_text="register again").click()
+        again.click()
         wait_until(page, "program.state.verdicts[0].verdict === 'good' && !program.state.working", 60)
         wait_until(page, "program.figure.panes.length === 3 && program.figure.panes.every((pane) => pane.drawn > 1)")
-        assert page.locator(".sk-verdict strong").inner_text() == "good"
+        assert page.locator(".sk-verdict strong").inner_text() == "good" and again.is_disabled()
         shades = page.evaluate("program.figure.panes[2].layers[0].described.shades.length")
         assert shades == 3 and page.errors == []                             # distance, confidence, plain
     assert set(read_landmarks(place / "scans" / "body1.landmarks.json")) == set(MARKS) - set(WRONG)

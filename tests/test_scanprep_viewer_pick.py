@@ -245,6 +245,46 @@ def test_left_and_right_are_swapped_and_back(folder):
     assert app.scans[0].places == before
 
 
+def test_one_crossed_pair_is_exchanged_by_itself(folder):
+    app = app_of(folder)
+    places = {"left toe": np.array([1.0, 0, 0]), "left knee": np.array([-1.0, 0, 1]), "navel": np.zeros(3),
+              "right toe": np.array([-1.0, 0, 0]), "right knee": np.array([1.0, 0, 1])}
+    app.scans[0].places = dict(places)
+    assert sent(app, "choose", name="navel")[-1].fields["pair"] is None
+    assert sent(app, "choose", name="right knee")[-1].fields["pair"] == "left knee"
+    sent(app, "swap", name="right knee")
+    exchanged = {**places, "left knee": places["right knee"], "right knee": places["left knee"]}
+    assert app.scans[0].places == exchanged
+    sent(app, "undo")
+    assert app.scans[0].places == places
+
+
+def test_undo_gives_the_file_back_as_it_was(folder):
+    """So that a scan is not registered again for a click that was taken back."""
+    path = folder / "anna.landmarks.json"
+    write_landmarks(path, {name: np.ones(3) * i for i, name in enumerate(FOUR)})
+    before, app = path.read_bytes(), app_of(folder)
+    sent(app, "remove", pane=1, name=FOUR[1])
+    assert path.read_bytes() != before
+    sent(app, "undo")
+    assert path.read_bytes() == before
+
+
+def test_landmarks_are_predicted_only_where_some_are_missing(folder):
+    app = app_of(folder)
+    known = read_landmarks(folder / "template.landmarks.json", app.template.body.shape)
+    places = {name: moved(point) for name, point in known.items()}
+    for count, possible in ((3, False), (4, True), (len(places) - 1, True), (len(places), False)):
+        app.scans[0].places = dict(list(places.items())[:count])
+        assert app.greet()[-1].fields["can_predict"] is possible, count
+    with pytest.raises(ValueError, match="then the others can be predicted"):
+        sent(app, "predict")
+    app.scans[0].places.pop("navel")
+    app.template = Clicked(folder / "template.ply", app.template.file, places=known,
+                           surface=Clickable(app.template.body.points))
+    assert app.greet()[-1].fields["can_predict"] is False              # a cloud is no template that can be registered
+
+
 def test_a_click_that_meets_nothing_is_told_and_wrong_messages_are_refused(folder):
     app = app_of(folder)
     assert "met nothing" in click(app, [50.0, 0, 0], "a")[-1].fields["note"] and not app.scans[0].places
@@ -441,6 +481,78 @@ def test_the_scan_is_shown_from_the_side_of_the_template(person, azimuth, known)
     marks = person.mesh.vertices[[landmarks()[name] for name in FOUR]]
     found = camera_like(first, person.mesh.vertices, body, (marks, marks @ R.T + 3) if known else None)
     assert found.axes[2] @ R @ first.axes[2] > np.cos(np.radians(20 if known else 31))
+
+
+@pytest.mark.parametrize("azimuth", [0, 90, 180, 215])
+@pytest.mark.parametrize("kind", ["mesh", "cloud", "noisy cloud"])
+def test_a_one_sided_scan_is_seen_from_outside(person, azimuth, kind):
+    """Not in a mirror: from where its camera was, and with a template from at most 60 degrees beside it."""
+    toward = np.array([np.sin(np.radians(azimuth)), -np.cos(np.radians(azimuth)), 0])
+    half = person.mesh.submesh(person.mesh.face_normals @ toward > 0.15)[0]
+    noise = np.random.default_rng(0).normal(0, 0.005 * (kind == "noisy cloud"), half.vertices.shape)
+    body = half if kind == "mesh" else half.vertices + noise
+    assert camera_of(body).axes[2] @ toward > np.cos(np.radians(30))
+    first, marks = camera_of(person.mesh), person.mesh.vertices[[landmarks()[name] for name in FOUR]]
+    for known in (None, (marks, marks)):
+        assert camera_like(first, person.mesh.vertices, body, known).axes[2] @ toward > np.cos(np.radians(75))
+
+
+@pytest.mark.slow
+def test_the_next_scan_opens_whole_and_its_long_name_is_read(new_page, folder, person):
+    """Zoomed in on one scan, the next one is seen from head to foot; the template's view stays as it was turned."""
+    name = f"{'a_long_name_of_a_scan_' * 4}.ply"
+    write_mesh(folder / name, person.mesh.with_vertices(1.05 * person.mesh.vertices))
+    reach = "program.figure.panes[{}].reach()"
+    with Server(app_of(folder, scans=("anna.ply", name))) as server:
+        page = new_page(viewport={"width": 1200, "height": 800})
+        page.goto(server.opening())
+        wait_until(page, DRAWN)
+        for pane in (0, 1):
+            page.locator(".sk-canvas").nth(pane).hover()
+            while page.evaluate(reach.format(pane)) < 3:
+                page.mouse.wheel(0, -300)
+                page.wait_for_timeout(30)
+        page.keyboard.press("]")
+        wait_until(page, f"program.state.scan === 1 && {reach.format(1)} <= 1")
+        assert page.evaluate(reach.format(0)) > 2.9
+        label = page.locator(".sk-label").nth(1)
+        assert label.inner_text() == name
+        assert page.get_by_label("scan", exact=True).get_attribute("title") == f"{name}: 0"
+        assert label.evaluate("(e) => e.scrollWidth <= e.clientWidth && e.scrollHeight <= e.clientHeight")
+        boxes = [page.locator(one).nth(1).bounding_box() for one in (".sk-label", ".sk-canvas")]
+        assert boxes[0]["height"] > 30 and boxes[0]["y"] + boxes[0]["height"] <= boxes[1]["y"]
+        assert page.errors == []
+
+
+@pytest.mark.slow
+def test_the_list_of_names_is_one_stop_of_the_tab_key(new_page, folder, person):
+    """Arrows choose in it; what is set, predicted and missing differs by its shape; one click exchanges a pair."""
+    app = app_of(folder)
+    true = {name: moved(person.mesh.vertices[landmarks()[name]]) for name in FOUR}
+    app.scans[0].places = {**true, FOUR[0]: true[FOUR[1]], FOUR[1]: true[FOUR[0]]}
+    app.scans[0].predicted = {"navel": moved(person.mesh.vertices[landmarks()["navel"]])}
+    with Server(app) as server:
+        page = new_page(viewport={"width": 1200, "height": 800})
+        page.goto(server.opening())
+        wait_until(page, DRAWN)
+        inside, chosen = "Boolean(document.activeElement.closest('.sk-names'))", "program.state.chosen"
+        page.locator(".sk-theme").focus()
+        page.keyboard.press("Tab")
+        assert page.evaluate(inside) and page.evaluate(f"document.activeElement.innerText.includes({chosen})")
+        for key, name in (("Home", FOUR[0]), ("ArrowDown", FOUR[1]), ("ArrowDown", FOUR[2]), ("ArrowUp", FOUR[1])):
+            page.keyboard.press(key)
+            wait_until(page, f"{chosen} === {json.dumps(name)} && document.activeElement.innerText === {chosen}")
+        page.keyboard.press("Tab")
+        assert not page.evaluate(inside)
+        page.locator("button", has_text=f"exchange with {FOUR[0]}").click()
+        wait_until(page, "program.state.undo")
+        assert all(np.array_equal(app.scans[0].places[name], true[name]) for name in FOUR)
+        shape = ("(e) => { const s = getComputedStyle(e);"
+                 "return [s.borderRadius, s.transform, s.backgroundColor.endsWith(' 0)')].join() }")
+        marks = {mark.get_attribute("aria-label"): mark.evaluate(shape) for mark in page.locator(".sk-dots > *").all()}
+        assert set(marks) == {"set", "predicted", "not set"} and len(set(marks.values())) == 3
+        wait_until(page, "program.figure.panes[1].layers.some(({labels}) => labels.includes('navel ?'))")
+        assert page.errors == []
 
 
 @pytest.mark.parametrize("width", [1400, 420])

@@ -23,6 +23,7 @@ from scanprep.geometry.farthest_points import spread_indices
 from scanprep.geometry.files import read_mesh, write_mesh
 from scanprep.geometry.landmarks import match_landmarks, read_landmark_vertices, read_landmarks, write_landmarks
 from scanprep.geometry.mesh import Mesh
+from scanprep.pipeline.again import Call
 from scanprep.pipeline.prepare import SCANS, Prepared, prepare
 from scanprep.pipeline.scans import TABLE, find_scans
 from scanprep.ranges import Cell, Count, Faces, Positive, Seed, Settings
@@ -201,6 +202,8 @@ class Demo:
                 space.drop(name)
             with self.bar("registering scans") as first, self.bar("finding the skeleton") as second:
                 done = prepare(tasks, template, marks, space.folder, None, first, second)
+            with space.staging("run") as staged:                # the set is mended as one of `scape prep run`
+                Call(self.folder / "scans", self.folder / "template.ply").write(staged.folder)
         if done.failures:
             raise ValueError("; ".join(done.failures))
         return done

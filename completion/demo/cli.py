@@ -10,7 +10,7 @@ from scanprep.console import Outcome, bar
 from scanprep.ranges import Seed
 
 from ..cli import Out
-from .chain import FULL, QUICK, Demo, DemoConfig
+from .chain import FULL, MODEL, QUICK, Demo, DemoConfig
 
 
 def demo(out: Out = Path("scape_demo"), quick: bool = False, full: bool = False, seed: Seed = DemoConfig.seed,
@@ -38,6 +38,6 @@ def demo(out: Out = Path("scape_demo"), quick: bool = False, full: bool = False,
     judgement = judge_demo(run, metrics)
     with bar("drawing the report") as progress, space.staging("page") as staged:
         write_page(run, metrics, judgement, progress, staged.folder)
-    return Outcome(out, metrics, {"demo": run.config}, judgement=judgement,
+    return Outcome(out, metrics, {"demo": run.config, "model": MODEL}, judgement=judgement,
                    following=f"open {out / 'report.html'} in a browser; then your own scans: "
                    "scape prep run scans --template template.ply -o set")

@@ -17,7 +17,8 @@ from scanprep.pictures.page import Page
 from scanprep.pictures.scene import Pane
 from scanprep.pictures.shading import Bones, Dots, Shape, Solid
 
-SHOWN, BESIDE_EACH_OTHER = 6, 3      # bodies on the page, as more columns do not fit; and bodies in one figure
+DRAWN, BESIDE_EACH_OTHER = 24, 3     # bodies that are drawn, 0.1 MB each: more make the page slow; bodies in one figure
+COLUMNS = 6                          # bodies in one table: more do not fit on the page
 HEIGHT = (0.25, 0.30, 0.38)          # colour of the lines of heights: neutral, as they are beside the body
 
 
@@ -27,23 +28,25 @@ def measures_page(names: Sequence[str], bodies: Sequence[np.ndarray], measured: 
     several = f"{len(names)} bodies" if len(names) > 1 else names[0]
     page = Page(f"{several}, measured", "Where the tape ran on each body. Metres in the table file, millimetres here; "
                 "the weight is in kilograms.")
-    shown = range(min(SHOWN, len(names)))
-    for first in shown[::BESIDE_EACH_OTHER]:
-        group = shown[first:first + BESIDE_EACH_OTHER]
+    every, drawn = range(len(names)), range(min(DRAWN, len(names)))
+    for first in drawn[::BESIDE_EACH_OTHER]:
+        group = drawn[first:first + BESIDE_EACH_OTHER]
         caption = "" if first else ("Red: girths, a tape that spans hollows. Blue: lengths along the skin and widths. "
                                     "Grey, beside the body: heights. Drag to turn; the list hides and shows them.")
         page.bodies([_pane(names[k], bodies[k], measured[k], tapes, len(group) == 1) for k in group], caption,
                     560 if len(group) < 3 else 420)
-    if len(names) > SHOWN:
-        page.text(f"The first {SHOWN} of {len(names)} bodies; all are in the table file.")
-    page.table([(_words(both), *(_cell(measured[k], both, sex) for k in shown)) for both in _pairs()
-                if any(name in measured[k].readings for k in shown for name in both)],
-               ("mm", *(names[k] for k in shown)))
+    if len(names) > DRAWN:
+        page.text(f"Drawn are the first {DRAWN} of {len(names)} bodies.")
+    for first in every[::COLUMNS]:
+        group = every[first:first + COLUMNS]
+        page.table([(_words(both), *(_cell(measured[k], both, sex) for k in group)) for both in _pairs()
+                    if any(name in measured[k].readings for k in group for name in both)],
+                   ("mm", *(names[k] for k in group)))
     if sex:
         page.text(f"In brackets: the percentile among {survey(sex).people:,} {WORDS[sex]} of ANSUR II, the survey of "
                   "US Army personnel of 2012. Soldiers are leaner and younger than everybody. "
                   "Measures that the survey took in another way have none.")
-    notes = [(names[k], line) for k in shown for line in (
+    notes = [(names[k], line) for k in every for line in (
         *measured[k].turned, *(f"no {name.replace('_', ' ')}: {why}" for name, why in measured[k].missing.items()))]
     if notes:
         page.section("To be looked at").table(notes)

@@ -19,7 +19,7 @@ from scanprep.console import Metric, Outcome, write_report
 from scanprep.depth_camera.picture import DepthPicture
 from scanprep.geometry.files import name_of
 from scanprep.geometry.mesh import Mesh
-from scanprep.pictures.scene import Pane, pack_scene
+from scanprep.pictures.scene import Pane
 from scanprep.viewer.app import Send
 from scanprep.viewer.clicked import Clicked
 from scanprep.viewer.dropped import Dropped, with_camera
@@ -141,7 +141,7 @@ class CompleteApp(PickApp):
             panes.append(self.scan_pane())
             if (result := self._result_pane()) is not None:
                 panes.append(replace(result, label="the whole body"))
-        return Message("scene", {}, pack_scene(panes))
+        return self.pack(panes)
 
     def _result_pane(self) -> Pane | None:
         """Return the pane of the completed body, None before there is one."""
@@ -234,7 +234,7 @@ class CompleteApp(PickApp):
         _ = one.shown                                            # what cannot be shown is refused
         with self._lock:
             known = [i for i, other in enumerate(self.scans) if other.path == path]
-            self.current = known[0] if known else len(self.scans)
+            self.current, self.opened = known[0] if known else len(self.scans), self.opened + 1
             self.scans[self.current:self.current + 1] = [one]
             self.made.pop(path, None)
             self.choose_next(None)

@@ -14,7 +14,6 @@ from scanprep.batch.workspace import HOME, Workspace
 from scanprep.console import keep_report
 from scanprep.folders import judgement_on, load_results
 from scanprep.judgement import Judgement
-from scanprep.pictures.scene import pack_scene
 from scanprep.viewer.app import Send
 from scanprep.viewer.clicked import Clicked
 from scanprep.viewer.messages import Message
@@ -113,7 +112,7 @@ class CompletionsApp(ResultsApp, CompleteApp):
             return super().scene()
         except (ValueError, OSError) as error:
             self.note = str(error)
-            return Message("scene", {}, pack_scene([self.template.pane("the model")]))
+            return self.pack([self.template.pane("the model")])
 
     def judgements(self) -> Iterable[Judgement | None]:
         """Return the judgement of every scan."""

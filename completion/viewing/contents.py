@@ -19,7 +19,7 @@ from scanprep.pictures.colors import part_colors
 from scanprep.pictures.scene import NO_INDEX
 from scanprep.pictures.shading import CLAY, Dots, Heat, Moving, Shape, Solid
 from scanprep.pictures.thinning import thin_solid
-from scanprep.viewer.clicked import camera_before
+from scanprep.viewer.clicked import as_mesh, camera_before
 
 from ..partial.completion import Completion
 
@@ -96,7 +96,7 @@ class Content:
 
 def of_mesh(name: str, shape: Mesh | np.ndarray, landmarks: dict[str, np.ndarray] | None = None) -> Content:
     """Show a mesh, or points (n, 3), with landmarks; simplified so that a browser turns it smoothly."""
-    mesh = shape if isinstance(shape, Mesh) else Mesh(shape, np.zeros((0, 3), dtype=np.int64))
+    mesh = as_mesh(shape)
     stance = Stance.of(mesh)
     marks = [mark_places(landmarks, stance, "landmarks")] if landmarks else []
     if not len(mesh.faces):

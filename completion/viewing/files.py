@@ -24,7 +24,7 @@ from ..mocap.files.markers import MarkerSequence
 from ..motion import Motion
 from ..partial.completion import load_completion
 from .contents import Content, collect_warnings, from_camera, mark_places, of_completion, of_mesh, of_model
-from .kinds import layout_places, model_of_report, viewable_kind, worst_first
+from .kinds import DEEP, layout_places, model_of_report, viewable_kind, worst_first
 from .motions import of_markers, of_motion, read_recording
 from .soft import soft_tissue_of, with_soft_tissue
 from .statues import read_statue
@@ -70,7 +70,6 @@ class Files:
     PLACES = (".pp", ".json", ".lnd", ".landmarks.txt", ".landmarks.csv", ".fcsv")
     # kinds of files that are shown from a folder
     SHOWN = ("surface", "picture", "model", "motion", "markers")
-    DEEP = 3                           # levels of folders to search: people, their recordings, and the results of these
 
     def __init__(self, paths: tuple[Path, ...] = (), model: Path | None = None, unit: Unit | None = None,
                  over: bool = False, rate: float | None = None) -> None:
@@ -136,11 +135,10 @@ class Files:
         return list(dict.fromkeys([*(path for path in self.known["model"] if path not in named), *named]))
 
     def read_model(self, path: Path) -> BodyModel:
-        """Read a model, each file once."""
-        path = path.resolve()
-        if path not in self._models:
-            self._models[path] = load_model(path)
-        return self._models[path]
+        """Read a model, a file or the name of a built-in one, each once."""
+        if (known := path.resolve()) not in self._models:
+            self._models[known] = load_model(path)
+        return self._models[known]
 
     # files
 
@@ -191,7 +189,7 @@ class Files:
 
     def _of_folder(self, folder: Path) -> list[Entry]:
         """List the things of a folder."""
-        entries = list(self._inside(folder, folder.resolve().name, self.DEEP))
+        entries = list(self._inside(folder, folder.resolve().name, DEEP))
         if not entries:
             raise ValueError(f"{folder}: expected meshes, a registered set, or what a command wrote; found none")
         return entries
@@ -282,7 +280,7 @@ class Files:
         """Find the model of a motion: the named one, that of the report beside it, or one among the files."""
         if self.model is not None:
             return self.read_model(self.model)
-        for folder in list(path.resolve().parents)[:self.DEEP]:
+        for folder in list(path.resolve().parents)[:DEEP]:
             name = model_of_report(folder / "report.json")
             if name is not None:
                 return self.read_model(name)

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from model.files import BUILT_IN, KINDS
+from model.files import KINDS, LOADERS
 from model.motion.files import is_motion
 from scanprep.dataset import RegisteredSet
 from scanprep.depth_camera.picture import camera_file, is_picture
@@ -17,6 +17,8 @@ from scanprep.geometry.mesh import Mesh
 
 from ..mocap.files.markers import READERS
 from ..mocap.marker_sets.layout import MarkerLayout
+
+DEEP = 3                             # levels of folders to search: people, their recordings, and the results of these
 
 
 def viewable_kind(path: Path) -> str:
@@ -38,13 +40,17 @@ def viewable_kind(path: Path) -> str:
 
 
 def model_of_report(path: Path) -> Path | None:
-    """Return the model named in the report of a command, if it still exists; else None."""
+    """Return the model named in the report of a command: a built-in one, or its file if it still exists; else None.
+
+    Results and model may have been moved together: a file is sought in the folders above the report too.
+    """
     try:
         settings: Any = storage.read_json(path, "a report").get("settings", {})
         model = Path(str(settings["model"]))
     except (storage.StorageError, AttributeError, KeyError, TypeError):
         return None
-    return model if model.is_file() or str(model) == BUILT_IN else None
+    places = [*(folder / model for folder in list(path.absolute().parents)[:DEEP]), model]
+    return next((place for place in places if place.is_file()), model if str(model) in LOADERS else None)
 
 
 def worst_first(registered: RegisteredSet) -> list[tuple[str, str]]:

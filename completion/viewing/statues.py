@@ -10,7 +10,7 @@ from model.files import load_model
 from model.statue.control.model import FOLDED, HOLE, MEASURED, Statue
 from model.statue.detail.reconstruction import Reconstruction, coverage_at
 from model.statue.detail.subdivision import chart_places, subdivide_uniform
-from model.statue.files import body_model, load_statue
+from model.statue.files import BODY, body_model, load_statue
 from scanprep.geometry.mesh import Mesh
 from scanprep.pictures.colors import part_colors
 from scanprep.pictures.shading import CLAY, Solid
@@ -76,7 +76,7 @@ def movable(model: BodyModel, statue: Statue | None) -> MovableBody:
 def read_statue(name: str, folder: Path) -> Content:
     """Read the statue of a folder, with the model beside it, which knows the poses of people."""
     statue = load_statue(folder)
-    model = load_model(folder / "body.npz") if (folder / "body.npz").is_file() else None
+    model = load_model(folder / BODY) if (folder / BODY).is_file() else None
     same = model is not None and np.array_equal(model.template.faces, statue.control.mesh.faces)
     return of_statue(name, statue, model if same else None)
 

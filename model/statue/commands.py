@@ -48,7 +48,7 @@ from .detail.reconstruction import (
 )
 from .detail.subdivision import subdivide_adaptive, subdivide_uniform
 from .detail.texels import bake_texture, scan_look
-from .files import load_statue, save_statue, write_body, write_for_programs, write_statue_glb
+from .files import BODY, body_model, load_statue, save_statue, write_body, write_for_programs, write_statue_glb
 from .fit import FittedStatue, StatueConfig, fit_statue
 from .motion.motions import follower_of, read_statue_motion, write_body_motion
 from .registration.automatic import guess_person_unit
@@ -285,7 +285,7 @@ def animate(statue: StatueArg, motion: MotionArg, output: Output, model: Path | 
     Args:
         statue: Folder of scape statue fit.
         motion: .bvh, or .npz with poses, trans and mocap_frame_rate.
-        output: Folder to write: statue.glb, motion.npz, motion.gif, and meshes on demand.
+        output: Folder to write: statue.glb, motion.npz with its model body.npz, motion.gif, and meshes on demand.
         model: Learned model (.npz) that the control mesh follows.
         registered: The model's template on the scan, in its triangles; else it is brought there.
         rate: Frames a second, where the motion's file does not say or says it wrongly.
@@ -305,6 +305,7 @@ def animate(statue: StatueArg, motion: MotionArg, output: Output, model: Path | 
         write_statue_glb(output / "statue.glb", control, detailed(control.mesh.vertices), fine, loaded.texture,
                          motion=moved, up=up)
         write_body_motion(output / "motion.npz", control, moved)
+        body_model(control).save(output / BODY)                  # the model of the motion, to look at it by itself
         rows = [Metric("joints that follow the motion", len(moved.matched)),
                 *([Metric("joints without one in the motion", ", ".join(moved.lacking))] if moved.lacking else [])]
     else:
@@ -334,5 +335,5 @@ def animate(statue: StatueArg, motion: MotionArg, output: Output, model: Path | 
     doubts = [f"{100 * share:.1f}% of the triangles are inverted in a frame: the pose is beyond what the skin can "
               "follow"] if share > 0.008 else []
     return Outcome(output, [Metric("frames", len(bodies)), Metric("rate", frame_rate, "1/s"), *rows,
-                            Metric("inverted triangles in a frame, most", max(inverted))], {"level": level},
-                   judgement=Judgement.of(check=doubts))
+                            Metric("inverted triangles in a frame, most", max(inverted))],
+                   {"level": level, "model": model or BODY}, judgement=Judgement.of(check=doubts))

@@ -29,7 +29,7 @@ from .detail.texels import chart_tangents, normal_image, vertex_of_row
 from .motion.motions import people_motion
 
 KIND, VERSION = "statue", 1
-CONTROL, ABOUT, TEXTURE = "control.npz", "statue.json", "texture.png"
+CONTROL, ABOUT, TEXTURE, BODY = "control.npz", "statue.json", "texture.png", "body.npz"
 
 
 def save_statue(folder: str | Path, statue: Statue) -> None:
@@ -130,7 +130,7 @@ def write_body(folder: Path, statue: Statue) -> None:
         poses = people_motion(control, statue.pose, np.array([people.random_pose(rng) for _ in range(100)])).poses
         storage.write_json(folder / "markers.json", {"markersets": [{
             "type": "body", "distance_from_skin": 0.0095, "indices": humanoid_markers()}]})      # [MoSh]
-    body_model(control, poses).save(folder / "body.npz")
+    body_model(control, poses).save(folder / BODY)
 
 
 def body_model(control: ControlModel, poses: np.ndarray | None = None) -> SkinningModel:

@@ -33,10 +33,12 @@ class KeptCall:
 
     def write(self, folder: Path) -> None:
         """Write the call into a folder."""
-        stored: dict[str, Any] = {f.name: with_paths(getattr(self, f.name), Path.absolute) for f in fields(self)}
-        # a text that names an existing file becomes an absolute path; a keyword stays as it is
-        stored |= {name: str(Path(stored[name]).absolute()) for name in self.may_be_files
-                   if stored[name] is not None and Path(stored[name]).exists()}
+        def find_place(path: Path) -> Path:
+            """Return the absolute path of a file; a keyword, as the name of a built-in model, stays as it is."""
+            return path.absolute() if path.exists() else path
+
+        stored: dict[str, Any] = {f.name: with_paths(getattr(self, f.name), find_place) for f in fields(self)}
+        stored |= {name: str(find_place(Path(stored[name]))) for name in self.may_be_files if stored[name]}
         stored["config"] = config_files.write_settings({"config": stored["config"]})
         storage.write_json(folder / RUN, {"kind": _kind(self), "version": VERSION, **stored})
 

@@ -166,6 +166,14 @@ class Workspace:
         """Return whether `run` would keep the existing result of a task."""
         return self._load_if_valid(task.name, self._key(self.digests.of(work), task)) is not NOTHING
 
+    def has_changed(self, task: Task) -> bool:
+        """Return whether the inputs of a task alone, not those of all, have changed since its result was made.
+
+        True where there is no result.
+        """
+        header = _read_record(self._record(task.name), self.folder)
+        return header is None or header["digest"] != self._key(header["work"], task)
+
     @contextlib.contextmanager
     def instead(self, work: Any, task: Task) -> Iterator[Staged]:
         """Stage a result that replaces the one of a task; afterwards `run` takes the task as done."""

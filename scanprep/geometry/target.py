@@ -53,7 +53,7 @@ def target_of(scan: Mesh | np.ndarray, name: str = "scan") -> Target:
     near = cKDTree(points).query(points, min(16, len(points)), workers=search_threads(len(points)))[1]
     if normals is not None:
         return Target(points, _average_normals(points, normals, near), _one_sided(points, near), True, index=index)
-    return Target(points, _spread_normals(points[near]), _one_sided(points, near), False, index=index)
+    return Target(points, spread_normals(points[near]), _one_sided(points, near), False, index=index)
 
 
 def _average_normals(points: np.ndarray, normals: np.ndarray, near: np.ndarray) -> np.ndarray:
@@ -66,14 +66,14 @@ def _average_normals(points: np.ndarray, normals: np.ndarray, near: np.ndarray) 
     length = np.linalg.norm(mean, axis=1)
     lost = length < 1e-9                     # otherwise at least its own unit normal is in the sum
     if lost.any():
-        plane = _spread_normals(points[near[lost]])
+        plane = spread_normals(points[near[lost]])
         against = np.einsum("nd,nd->n", plane, normals[near[lost]].sum(axis=1)) < 0
         mean[lost], length[lost] = np.where(against[:, None], -plane, plane), 1.0
     mean /= length[:, None]
     return mean
 
 
-def _spread_normals(near: np.ndarray) -> np.ndarray:
+def spread_normals(near: np.ndarray) -> np.ndarray:
     """Estimate unit normals (n, 3) by the least spread of each point's neighbours (n, k, 3); signs are arbitrary."""
     offset = near - near.mean(axis=1, keepdims=True)
     return np.linalg.eigh(np.matmul(offset.transpose(0, 2, 1), offset))[1][:, :, 0]

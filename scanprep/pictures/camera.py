@@ -6,9 +6,11 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from ..geometry.format_glb import tallest
 from ..geometry.mesh import Mesh
+from ..geometry.target import spread_normals
 
 
 @dataclass(frozen=True, eq=False)
@@ -126,9 +128,10 @@ def _points(subject: Any) -> np.ndarray:
 def guess_upright(mesh: Mesh) -> tuple[int, float]:
     """Guess the axis that is up, and the azimuth, degrees, of a camera that sees the front; for pictures only.
 
-    Up is the axis of the largest extent, unless arms are spread wider (`tallest`). The front is where the toes point.
-    On each side that is the direction from what lies within a tenth of the height to the lowest twentieth. Of 71 poses
-    of a man it is off by more than 60 degrees in 8. Without feet it is the side from which the body is widest.
+    Up is the axis of the largest extent, unless arms are spread wider (`tallest`). The front of a one-sided scan is the
+    side that was seen (`outer_side`), else where the toes point. On each foot that is the direction from what lies
+    within a tenth of the height to the lowest twentieth. Of 71 poses of a man it is off by more than 60 degrees in 8.
+    Without feet it is the side from which the body is widest.
     """
     extent = np.ptp(mesh.vertices, axis=0)
     up = tallest(mesh.vertices)
@@ -146,7 +149,37 @@ def guess_upright(mesh: Mesh) -> tuple[int, float]:
     toes = sum((_toes(flat[side], height[side], weights[side]) for side in (left, ~left)), np.zeros(2))
     if np.linalg.norm(toes) > 0.01 * extent[up]:
         forward = toes
+    if (seen := outer_side(mesh, up)) is not None:
+        forward = seen[[(up + 1) % 3, (up + 2) % 3]]
     return up, float(np.degrees(np.arctan2(forward[1], forward[0])))
+
+
+def outer_side(mesh: Mesh, up: int) -> np.ndarray | None:
+    """Find the horizontal direction (3,) from which a one-sided scan was seen; None for a body seen all around.
+
+    Triangles face it. Points have no side: their normals come from their neighbours, and are turned to one of the two
+    sides from which most face away. They diverge where this is the outside, as the body is rounder than hollow.
+    """
+    flat = np.arange(3) != up
+    if len(mesh.faces):
+        # mean normal: a ball seen from one side has a length of 0.5, from three quarters around 0.24
+        mean = flat * (mesh.face_areas @ mesh.face_normals) / max(mesh.face_areas.sum(), 1e-12)
+        length = float(np.linalg.norm(mean))
+        return mean / length if length > 0.2 else None
+    # 2000 points are 2 cm apart on a person, more than the noise of depth cameras; fewer than 500 may be markers
+    points = mesh.vertices[np.random.default_rng(0).permutation(len(mesh.vertices))[:2000]]
+    if len(points) < 500:
+        return None
+    near = cKDTree(points).query(points, 16)[1]
+    normals = spread_normals(points[near])
+    way = np.linalg.eigh((flat * normals).T @ (flat * normals))[1][:, -1]
+    normals = np.where((normals @ way)[:, None] < 0, -normals, normals)
+    step, change = points[near] - points[:, None], normals[near] - normals[:, None]
+    length = np.linalg.norm(step, axis=2) * np.linalg.norm(change, axis=2)
+    # cosine between the way to a neighbour and the change of the normal: of 21 half views at least 0.45, with 6 mm of
+    # noise 0.35; of whole bodies below 0.06
+    rounder = float(np.einsum("nkd,nkd->", step, change) / max(length.sum(), 1e-12))
+    return np.sign(rounder) * way if abs(rounder) > 0.2 else None
 
 
 def _toes(flat: np.ndarray, height: np.ndarray, weights: np.ndarray) -> np.ndarray:

@@ -182,11 +182,16 @@ def _set_up(space: Workspace, tasks: Sequence[ScanTask], template: Mesh, templat
     # a fresh copy without cached properties, as it is sent to the workers
     bare = Mesh(template.vertices, template.faces, template.colors)
     parts = space.step("person", bare, lambda folder: person_parts(bare, progress))
-    model = Path(config.scan.through) if Path(config.scan.through).is_file() else None
-    tasks = [replace(task, model=model) for task in tasks]
+    tasks = name_model(tasks, config)
     lead = _lead(space, bare, tasks, config.scan.through, progress)
     return RegisterScan(bare, {name: int(v) for name, v in template_landmarks.items()}, config.scan,
                         parts if lead is None else parts or lead.parts, lead), tasks
+
+
+def name_model(tasks: Sequence[ScanTask], config: PrepareConfig) -> list[ScanTask]:
+    """Return the scans with the file of the model that leads the template, if there is one."""
+    model = Path(config.scan.through) if Path(config.scan.through).is_file() else None
+    return [replace(task, model=model) for task in tasks]
 
 
 def _write_all(space: Workspace, work: RegisterScan, tasks: Sequence[ScanTask], failures: Mapping[str, str],

@@ -16,13 +16,14 @@ from ..geometry.files import UNITS, name_of, read_scan
 from ..geometry.landmarks import landmarks_beside, read_landmarks, write_landmarks
 from ..geometry.mesh import Mesh
 from ..geometry.surface import Surface
-from ..pictures.camera import Camera, guess_upright
+from ..pictures.camera import Camera, guess_upright, outer_side
 from ..pictures.scene import Pane
 from ..pictures.shading import CLAY, Dots, Shape, Solid
 from ..pictures.thinning import thin_solid
 from .surface_clicks import Clickable
 
 KEPT = ".before"                     # ending of the backup of a landmark file, made before its first change
+MOST_ASIDE = 60                      # degrees from the middle of its outside, at which a one-sided scan is shown first
 
 Places = dict[str, np.ndarray]
 
@@ -39,6 +40,7 @@ class Clicked:
     surface: Clickable | None = None
     _shown: Shape | None = None
     _saved: bool = False                 # by this program
+    _order: tuple[str, ...] = ()         # names in the order of the file, also of those taken away, which may come back
 
     @classmethod
     def load(cls, path: Path, ending: str, unit: str | None = None, file: Path | None = None) -> Clicked:
@@ -47,6 +49,7 @@ class Clicked:
         one = cls(path, file or path.with_name(name_of(path) + ending), unit)
         if file is not None:
             one.places = one._read(file)
+            one._order = tuple(one.places)
         return one
 
     def _read(self, file: Path) -> Places:
@@ -74,9 +77,10 @@ class Clicked:
         backup = self.file.with_name(self.file.name + KEPT)
         if self.file.exists() and not self._saved and not backup.exists():
             shutil.copyfile(self.file, backup)
-        self._saved = True
+        self._saved, self._order = True, tuple(dict.fromkeys([*self._order, *self.places]))
         if self.places:
-            write_landmarks(self.file, self.places, self.unit)
+            write_landmarks(self.file, {name: self.places[name] for name in self._order if name in self.places},
+                            self.unit)
         else:                                                    # a file without landmarks could not be read again
             self.file.unlink(missing_ok=True)
 
@@ -123,9 +127,14 @@ def camera_before(points: np.ndarray) -> Camera:
 
 def camera_of(shape: Mesh | np.ndarray) -> Camera:
     """Return a view of a body from its front, as far as its outline shows where that is."""
-    body = shape if isinstance(shape, Mesh) else Mesh(shape, np.zeros((0, 3), dtype=np.int64))
+    body = as_mesh(shape)
     up, front = guess_upright(body)
     return Camera.around(body.vertices, front, up=up)
+
+
+def as_mesh(shape: Mesh | np.ndarray) -> Mesh:
+    """Return a mesh as it is, and points (n, 3) as one without triangles."""
+    return shape if isinstance(shape, Mesh) else Mesh(shape, np.zeros((0, 3), dtype=np.int64))
 
 
 def camera_like(first: Camera, template: np.ndarray, body: Mesh | np.ndarray,
@@ -133,15 +142,17 @@ def camera_like(first: Camera, template: np.ndarray, body: Mesh | np.ndarray,
     """Return a view of a body from the same side from which a camera sees a template, points (n, 3).
 
     The side follows from landmarks (L, 3) of both, at least three. Without them it is the turn about the vertical at
-    which both shapes match best.
+    which both shapes match best. A one-sided scan is never seen from its inside.
     """
     own_view = camera_of(body)
-    points = body.vertices if isinstance(body, Mesh) else body
+    points, outward = as_mesh(body).vertices, outer_side(as_mesh(body), int(np.abs(own_view.vertical).argmax()))
     if landmarks is not None:
         # with landmarks: turn the template's view like the body; a view from above or below is not helpful
         R_body_template = landmark_motion(*landmarks)[:3, :3]
         side = R_body_template @ first.axes[2]
-        return Camera.from_side(points, side, own_view.vertical) if abs(side @ own_view.vertical) < 0.9 else own_view
+        outside = outward is None or side @ outward > np.cos(np.radians(MOST_ASIDE))
+        return Camera.from_side(points, side, own_view.vertical) \
+            if outside and abs(side @ own_view.vertical) < 0.9 else own_view
 
     def seen(camera: Camera, all_points: np.ndarray, turn: float = 0.0) -> np.ndarray:
         """Return a sample of points as right, up and towards a turned camera, in units of their height."""
@@ -155,8 +166,8 @@ def camera_like(first: Camera, template: np.ndarray, body: Mesh | np.ndarray,
         return np.asarray((local - np.median(local, axis=0)) / max(float(np.ptp(local[:, 1])), 1e-12))
 
     target = cKDTree(seen(first, template))
-    # try turns in steps of 15 degrees
-    turns = np.radians(np.arange(0, 360, 15))
+    # try turns in steps of 15 degrees; a one-sided scan's own view is from the middle of its outside
+    turns = np.radians(np.arange(0, 360, 15) if outward is None else np.arange(-MOST_ASIDE, MOST_ASIDE + 1, 15))
     best = min(turns, key=lambda turn: float(target.query(seen(own_view, points, turn))[0].mean()))
     right = np.cross(own_view.vertical, own_view.axes[2])
     return Camera.from_side(points, np.cos(best) * own_view.axes[2] + np.sin(best) * right, own_view.vertical)

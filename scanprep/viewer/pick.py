@@ -64,6 +64,7 @@ class PickApp:
         self.done: list[Change] = []
         self.undone: list[Change] = []
         self.chosen: str | None = None
+        self.opened = 0                  # how often another scan was opened: the page then fits its cameras anew
         self.working: tuple[str, int, int] | None = None
         self.note = ""
         self._lock = threading.RLock()
@@ -86,7 +87,11 @@ class PickApp:
         panes = [self.template.pane(self.template.path.name)]
         if self.scan is not None:
             panes.append(self.scan_pane())
-        return Message("scene", {}, pack_scene(panes))
+        return self.pack(panes)
+
+    def pack(self, panes: Sequence[Pane]) -> Message:
+        """Pack panes into a message."""
+        return Message("scene", {"opened": self.opened}, pack_scene(panes))
 
     def scan_pane(self) -> Pane:
         """Return the shown scan, seen from the same side as the template."""
@@ -113,8 +118,19 @@ class PickApp:
                           for one in shown],
                 "scan": self.current,
                 "scans": [{"name": one.path.name, "count": len(one.places)} for one in self.scans],
-                "undo": bool(self.done), "redo": bool(self.undone), "working": self.working, "enough": self.ENOUGH,
-                "question": self.question, **self.more()}, latest="state")
+                "undo": bool(self.done), "redo": bool(self.undone), "working": self.working, "question": self.question,
+                "pair": self._pair(), "can_predict": self._can_predict(), **self.more()}, latest="state")
+
+    def _pair(self) -> str | None:
+        """Return the landmark of the other side, where the scan has the chosen one and that."""
+        other = other_side(self.chosen or "")
+        return other if self.scan is not None and {self.chosen, other} <= set(self.scan.places) else None
+
+    def _can_predict(self) -> bool:
+        """Return whether the scan lacks landmarks of the template, and has enough others for a registration."""
+        template, scan = self.template, self.scan
+        common = sum(name in scan.places for name in template.places) if scan else 0
+        return self.ENOUGH <= common < len(template.places) and template.body.has_surface
 
     def more(self) -> dict[str, Any]:
         """Return what an app built on this one adds to the state."""
@@ -191,15 +207,20 @@ class PickApp:
             self.note = f"{name} is taken away; a click sets it again, undo brings it back"
         self.chosen = name
 
-    def on_swap(self, send: Send) -> None:
-        """Exchange left and right on the scan, the most frequent error in landmarks; it can be undone."""
+    def on_swap(self, send: Send, name: str | None = None) -> None:
+        """Exchange left and right on the scan, the most frequent error in landmarks; it can be undone.
+
+        With a name only this landmark is exchanged with that of the other side.
+        """
         one = self._editable(SCAN)
-        others = {name: other for name in one.places if (other := other_side(name)) is not None}
-        after = {other: one.places[name] for name, other in others.items()}
+        names = [each for each in one.places if name is None or name in (each, other_side(each))]
+        others = {each: other for each in names if (other := other_side(each)) is not None}
+        after = {other: one.places[each] for each, other in others.items()}
         if not after:
             raise ValueError("no landmark of the scan names a side")
-        self._change(self.current, {**after, **{name: None for name in others if name not in after}})
-        one.predicted = {other_side(name) or name: place for name, place in one.predicted.items()}
+        self._change(self.current, {**after, **{each: None for each in others if each not in after}})
+        if name is None:
+            one.predicted = {other_side(each) or each: place for each, place in one.predicted.items()}
 
     def on_choose(self, send: Send, name: str) -> None:
         """Choose the landmark that the next click sets; a new name joins the list."""
@@ -211,7 +232,7 @@ class PickApp:
             raise ValueError(f"scan: expected 0 to {len(self.scans) - 1}, got {scan}")
         if scan != self.current:
             self.scans[self.current].forget()
-            self.current = scan
+            self.current, self.opened = scan, self.opened + 1
             self.choose_next(None)
             send(self.scene())
 
@@ -319,19 +340,17 @@ class PickApp:
     def _predict_if_time(self, send: Send, pane: int) -> None:
         """Predict when a scan has just got enough landmarks, and the template has more."""
         scan = self.scan
-        if pane == SCAN and scan is not None and not scan.predicted and self.working is None:
-            common = [name for name in self.template.places if name in scan.places]
-            if len(common) == self.ENOUGH < len(self.template.places):
-                self._predict(scan, send)
+        if pane == SCAN and scan is not None and not scan.predicted and self.working is None and self._can_predict() \
+                and sum(name in scan.places for name in self.template.places) == self.ENOUGH:
+            self._predict(scan, send)
 
     def _predict(self, clicked: Clicked, send: Send) -> None:
         """Predict the missing landmarks of a scan in a thread of its own."""
-        common = [name for name in self.template.places if name in clicked.places]
         template = self.template.body.shape
-        if len(common) < self.ENOUGH:
+        if not self._can_predict() or not isinstance(template, Mesh):
             raise ValueError(
                 f"click {self.ENOUGH} landmarks that the template has too, then the others can be predicted")
-        if self.working is not None or not isinstance(template, Mesh):
+        if self.working is not None:
             return
         on_template, on_scan, body = dict(self.template.places), dict(clicked.places), clicked.body
 

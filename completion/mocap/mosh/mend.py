@@ -14,7 +14,6 @@ from scanprep.batch.workspace import HOME, Results, Workspace
 from scanprep.console import Metric, Outcome, judgement_of
 from scanprep.geometry.mesh import Mesh
 from scanprep.judgement import Judgement
-from scanprep.pictures.scene import pack_scene
 from scanprep.viewer.app import Send
 from scanprep.viewer.clicked import Clicked
 from scanprep.viewer.messages import Message
@@ -116,7 +115,7 @@ class MoshApp(ResultsApp):
         frame = self.person.worst[self.frame]
         panes = [replace(self.template.pane("the layout"), label="where the layout has them"),
                  self.scan.pane(f"{self.person.name}: where they were found"), self.person.pane(frame)]
-        return Message("scene", {}, pack_scene(panes))
+        return self.pack(panes)
 
     def judgements(self) -> Iterable[Judgement | None]:
         """Return the judgement of every person."""
@@ -146,7 +145,7 @@ class MoshApp(ResultsApp):
         if not 0 <= scan < len(self.scans):
             raise ValueError(f"person: expected 0 to {len(self.scans) - 1}, got {scan}")
         if scan != self.current:
-            self.current, self.frame = scan, 0
+            self.current, self.frame, self.opened = scan, 0, self.opened + 1
             self.choose_next(None)
             send(self.scene())
 

@@ -26,13 +26,13 @@ export class Mend extends Pick {
 
   update(state) {
     super.update(state);
-    const { scans, scan, verdicts, changed, template_changed: all, working, rivals } = state;
+    const { scan, verdicts, changed, template_changed: all, outdated, working, rivals } = state;
     const { verdict, reasons } = verdicts[scan];
     this.verdict.dataset.verdict = verdict;
-    const mended = all || changed.includes(scans[scan].name.split(".")[0]);
-    this.verdict.replaceChildren(make("strong", {}, mended ? `${WORDS[verdict]}; its landmarks changed since` : WORDS[verdict]),
+    this.verdict.replaceChildren(make("strong", {}, outdated && verdict !== "new" ? `${WORDS[verdict]}; changed since` : WORDS[verdict]),
       make("ul", {}, ...reasons.map((reason) => make("li", {}, reason))));
-    this.go.disabled = this.other.disabled = Boolean(working);
+    this.other.disabled = Boolean(working);
+    this.go.disabled = Boolean(working) || !(all || changed.length);
     this.other.hidden = !rivals[scan];
     this.go.textContent = all ? "register all scans again" : changed.length > 1 ? `register ${changed.length} scans again` : "register again";
   }

@@ -6,7 +6,7 @@ export class Mosh extends Pick {
   build() {
     super.build();
     this.alike = undefined;                             // at rest and in a frame people stand differently
-    for (const each of [this.added, this.insideBox.parentElement, this.buttons.swap, this.buttons.predict, this.buttons.confirm]) each.remove();
+    for (const each of [this.added, this.insideBox.parentElement, this.buttons.swap, this.buttons.pair, this.buttons.predict, this.buttons.confirm]) each.remove();
     this.scans.setAttribute("aria-label", "person");
     this.list.setAttribute("aria-label", "markers");
     this.verdict = make("div", { class: "sk-verdict" });

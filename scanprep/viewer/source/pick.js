@@ -11,7 +11,9 @@ const COLORS = { set: "#d5392f", chosen: "#f0a400", predicted: "#3b82c4" };
 export const WORDS = { good: "good", check: "look at it", failed: "failed", new: "new" };       // verdicts
 const KEYS = [["n, p", "next, previous name"], ["z, y", "undo, redo"], ["Delete", "take the landmark away"],
   ["c", "confirm the predicted ones"], ["[ and ]", "previous, next scan"], ["+ and -", "move it along the view, into the body"],
-  ["i", "click inside the body: joints"]];
+  ["i", "click inside the body: joints"], ["x", "exchange the pair: left for right"], ["arrows", "in the list: next, previous name"]];
+// What a list says of a landmark, by shape too: a disc, a diamond, a ring.
+const MARKS = { set: "sk-on", predicted: "sk-guess", "not set": "sk-off" };
 
 export class Pick extends Program {
   constructor(connection, page) {
@@ -29,7 +31,7 @@ export class Pick extends Program {
 
   build() {
     this.scans = make("select", { "aria-label": "scan", onchange: () => this.send("open", { scan: this.scans.selectedIndex }) });
-    this.list = make("ol", { class: "sk-names", "aria-label": "landmarks" });
+    this.list = make("ol", { class: "sk-names", role: "listbox", "aria-label": "landmarks", onkeydown: (event) => this.walk(event) });
     this.added = make("input", { placeholder: "another name", "aria-label": "another name", onkeydown: (event) => {
       if (event.key === "Enter" && this.added.value.trim()) { this.send("choose", { name: this.added.value }); this.added.value = ""; }
     } });
@@ -37,6 +39,7 @@ export class Pick extends Program {
       undo: button("undo", "take the last change back (z)", () => this.send("undo")),
       redo: button("redo", "make it again (y)", () => this.send("redo")),
       swap: button("swap left and right", "exchange the two sides of the scan's landmarks", () => this.send("swap")),
+      pair: button("exchange the pair", "each is where the other was: for a pair whose sides are mixed up (x)", () => this.send("swap", { name: this.state.chosen })),
       predict: button("predict the others", "register the template to the scan and see where the other landmarks should be", () => this.send("predict")),
       confirm: button("confirm all", "take all predicted landmarks as they are (c)", () => this.confirm()),
       next: button("skip", "go to the next name, as when the scan does not show this one (n)", () => this.step(1)),
@@ -54,9 +57,21 @@ export class Pick extends Program {
 
   confirm() { this.send("confirm", { names: Object.keys(this.waiting()) }); }
 
-  step(by) {
+  beyond(by) {
     const { names, chosen } = this.state;
-    this.send("choose", { name: names[(names.indexOf(chosen) + by + names.length) % names.length] });
+    return names[(names.indexOf(chosen) + by + names.length) % names.length];
+  }
+
+  step(by) { this.send("choose", { name: this.beyond(by) }); }
+
+  // The list is one stop of the Tab key: arrows choose in it, and the focus goes along with what is chosen.
+  walk(event) {
+    const { names } = this.state, focused = names[[...this.list.children].indexOf(event.target)];
+    const name = { ArrowDown: this.beyond(1), ArrowUp: this.beyond(-1), Home: names[0], End: names.at(-1), Enter: focused, " ": focused }[event.key];
+    if (!name) return;
+    event.preventDefault();
+    event.stopPropagation();
+    this.choose(name, event);
   }
 
   // How far a landmark of the scan is from where it is predicted, in metres; null where one of the two is missing.
@@ -76,16 +91,18 @@ export class Pick extends Program {
     this.scans.hidden = state.scans.length < 2;
     this.scans.replaceChildren(...state.scans.map(({ name, count }, i) => make("option", { selected: i === state.scan },
       state.verdicts ? `${WORDS[state.verdicts[i].verdict]} · ${name} (${count})` : `${name}: ${count}`)));
+    this.scans.title = this.scans.selectedOptions[0]?.text ?? "";
     this.buttons.undo.disabled = !state.undo;
     this.buttons.redo.disabled = !state.redo;
     const waiting = Object.keys(this.waiting()).length;
     this.buttons.confirm.disabled = !waiting;
     this.buttons.confirm.textContent = waiting ? `confirm ${waiting} predicted` : "confirm all";
-    const common = Object.keys(state.panes[0].places).filter((name) => name in (state.panes[1]?.places ?? {}));
-    this.buttons.predict.disabled = common.length < state.enough || Boolean(state.working);
+    this.buttons.predict.disabled = !state.can_predict || Boolean(state.working);
+    this.buttons.pair.disabled = !state.pair;
+    this.buttons.pair.textContent = state.pair ? `exchange with ${state.pair}` : "exchange the pair";
     this.buttons.next.disabled = state.names.length < 2;
     this.buttons.there.hidden = !(this.off(state.chosen) > OFF);
-    this.buttons.swap.hidden = this.buttons.predict.hidden = this.buttons.confirm.hidden = state.panes.length < 2;
+    this.buttons.swap.hidden = this.buttons.pair.hidden = this.buttons.predict.hidden = this.buttons.confirm.hidden = state.panes.length < 2;
     this.names();
     this.tellFile();
     this.ask(state.question);
@@ -119,17 +136,20 @@ export class Pick extends Program {
   }
 
   names() {
-    const { names, chosen, panes } = this.state;
+    const { names, chosen, panes } = this.state, focused = this.list.contains(document.activeElement);
     this.list.replaceChildren(...names.map((name) => {
-      const marks = panes.map((pane) => make("span", { class: name in pane.places ? "sk-on" : name in pane.predicted ? "sk-guess" : "sk-off",
-        title: name in pane.places ? "set" : name in pane.predicted ? "predicted" : "not set" }));
-      const item = make("li", { "aria-current": name === chosen ? "true" : null, tabindex: 0, onclick: (event) => this.choose(name, event),
-        onkeydown: (event) => { if (event.key === "Enter" || event.key === " ") { event.preventDefault(); event.stopPropagation(); this.choose(name, event); } } },
+      const marks = panes.map((pane) => {
+        const said = name in pane.places ? "set" : name in pane.predicted ? "predicted" : "not set";
+        return make("span", { class: MARKS[said], title: said, role: "img", "aria-label": said });
+      });
+      return make("li", { role: "option", "aria-selected": String(name === chosen), tabindex: name === chosen ? 0 : -1,
+        onclick: (event) => this.choose(name, event) },
         make("span", { class: "sk-dots" }, ...marks), make("span", {}, name), this.beside(name));
-      return item;
     }));
-    const current = this.list.querySelector("[aria-current]");
-    if (!current) return;                               // only the list is scrolled: on a telephone the page would leave the bodies
+    const current = this.list.querySelector("[aria-selected=true]");
+    if (!current) return;
+    if (focused) current.focus({ preventScroll: true });
+    // only the list is scrolled: on a telephone the page would leave the bodies
     const top = current.offsetTop - this.list.offsetTop, below = top + current.offsetHeight - this.list.clientHeight;
     if (top < this.list.scrollTop) this.list.scrollTop = top;
     else if (below > this.list.scrollTop) this.list.scrollTop = below;
@@ -163,7 +183,8 @@ export class Pick extends Program {
       const groups = { predicted: i === 1 ? this.waiting() : {}, set: {}, chosen: {} };
       for (const [name, place] of Object.entries(marks.places)) groups[name === this.state.chosen ? "chosen" : "set"][name] = place;
       for (const [group, places] of Object.entries(groups)) {
-        pane.setDots(group, Object.values(places), Object.keys(places), COLORS[group], i);
+        const labels = Object.keys(places).map((name) => group === "predicted" ? `${name} ?` : name);
+        pane.setDots(group, Object.values(places), labels, COLORS[group]);
       }
     });
   }
@@ -253,7 +274,7 @@ export class Pick extends Program {
       Delete: () => this.send("remove", { pane, name: chosen }), Backspace: () => this.send("remove", { pane, name: chosen }),
       c: () => this.confirm(), "[": () => scan > 0 && this.send("open", { scan: scan - 1 }),
       "]": () => scan < scans.length - 1 && this.send("open", { scan: scan + 1 }),
-      "+": () => slide(0.002), "-": () => slide(-0.002), i: () => this.insideBox.click(),
+      "+": () => slide(0.002), "-": () => slide(-0.002), i: () => this.insideBox.click(), x: () => this.buttons.pair.click(),
     };
     if (event.altKey || ((event.ctrlKey || event.metaKey) && !"zZy".includes(event.key))) return;
     if (actions[event.key]) { event.preventDefault(); actions[event.key](); }

@@ -93,14 +93,16 @@ export class Program {
     if (this.ending.signal.aborted) return;
     const before = this.figure?.panes.map((pane) => pane.view()), choices = this.figure?.choices();
     this.figure = new Figure(this.stage, scene, this.linked ?? true, this.alike);
+    const anew = fields.opened !== this.opened;         // another scan: it opens whole, the template stays as it is
+    this.opened = fields.opened;
     if (before && (this.alike || before.length === scene.panes.length)) {
-      this.figure.panes.slice(0, before.length).forEach((pane, i) => pane.restore(before[i]));
+      this.figure.panes.slice(0, anew ? 1 : before.length).forEach((pane, i) => pane.restore(before[i]));
       this.figure.choose(choices);
     }
     const [first, ...others] = this.figure.panes.slice(this.alike ?? Infinity);
     for (const pane of others) {
       pane.follow(first);
-      if (before?.length !== scene.panes.length) pane.fit();                    // else the view was chosen by hand
+      if (anew || before?.length !== scene.panes.length) pane.fit();            // else the view was chosen by hand
     }
     this.shown?.(this.figure);
   }
