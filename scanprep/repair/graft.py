@@ -36,7 +36,7 @@ def graft(scan: Mesh, closed: Mesh, body: Mesh) -> tuple[Mesh, int]:
         The scan with the pieces, manifold; holes that none fits stay open.
     """
     loops = [loop for loop in scan.boundary_loops if len(loop) >= 3]
-    missing = find_missing(scan, closed, body)
+    missing = find_missing(closed, body)
     pieces, faces, vertices, count = [], [scan.faces], [scan.vertices], len(scan.vertices)
     for chosen in missing:
         piece = body.submesh(chosen)[0]
@@ -60,16 +60,10 @@ def graft(scan: Mesh, closed: Mesh, body: Mesh) -> tuple[Mesh, int]:
     return repair(Mesh(np.concatenate(vertices), np.concatenate(faces))), len(pieces)
 
 
-def find_missing(scan: Mesh, closed: Mesh, body: Mesh) -> list[np.ndarray]:
-    """Find the pieces of a body that stand out from a closed scan where its open one ends: masks (F,) of triangles."""
+def find_missing(closed: Mesh, body: Mesh) -> list[np.ndarray]:
+    """Find the pieces of a body that stand out from a closed scan: masks (F,) of triangles."""
     off = Surface(closed).closest(body.vertices).distances
-    # where the nearest place of the open scan is on its border, something was cut off
-    nearest = Surface(scan).closest(body.vertices)
-    border = np.zeros(len(scan.vertices), dtype=bool)
-    border[scan.boundary_vertices] = True
-    cut = border[scan.faces[nearest.faces]].any(axis=1)
-    out = (off > PATCHED) & cut
-    inside = out[body.faces].all(axis=1)
+    inside = (off > PATCHED)[body.faces].all(axis=1)
     a, b = body.faces[inside][:, [0, 1]].T, body.faces[inside][:, [1, 2]].T
     label = label_components(a.ravel(), b.ravel(), len(body.vertices))
     of_face = label[body.faces[:, 0]]

@@ -1,0 +1,99 @@
+"""What a scan lacks of a person is grafted from the body that lies on it."""
+import igl
+import numpy as np
+import pytest
+
+from scanprep.geometry.mesh import Mesh
+from scanprep.geometry.places import point_areas
+from scanprep.geometry.surface import Surface
+from scanprep.registration.nonrigid import covers, register
+from scanprep.repair.graft import bridge, graft
+from scanprep.repair.hole_filling import close
+from scanprep.surfaces.template import TemplateConfig, template_of_scan
+from scanprep.synthetic.landmarks import landmarks
+from scanprep.synthetic.topology import load_topology
+
+
+@pytest.fixture(scope="module")
+def person():
+    return load_topology().mesh
+
+
+def cut_at(mesh: Mesh, places: np.ndarray, radius: float) -> Mesh:
+    """Cut a ball out of a mesh around each of the places (n, 3), metres."""
+    apart = np.linalg.norm(mesh.corners.mean(axis=1)[:, None] - places, axis=2)
+    return mesh.submesh((apart > radius).all(axis=1))[0]
+
+
+@pytest.fixture(scope="module")
+def without_a_finger_tip(person):
+    tip = person.vertices[landmarks()["left middle finger"]]
+    return cut_at(person, tip[None], 0.03), tip
+
+
+def test_a_finger_tip_that_was_cut_off_grows_again(person, without_a_finger_tip):
+    scan, tip = without_a_finger_tip
+    capped = close(scan)
+    assert Surface(capped).closest(tip[None]).distances[0] > 0.02            # a patch is a stump
+    whole, pieces = graft(scan, capped, Mesh(*igl.upsample(np.array(person.vertices), np.array(person.faces), 1)))
+    whole = close(whole)
+    assert pieces >= 1 and whole.is_closed and whole.is_edge_manifold
+    assert Surface(whole).closest(person.vertices).distances.max() < 0.004
+    # facing outward everywhere: as much volume as the person has
+    assert whole.volume == pytest.approx(person.volume, rel=2e-3)
+
+
+def test_a_hole_in_a_smooth_surface_is_left_to_its_patch(person):
+    scan = cut_at(person, person.vertices[landmarks()["navel"]][None], 0.03)
+    same, pieces = graft(scan, close(scan), person)
+    assert pieces == 0 and same is scan
+
+
+@pytest.mark.slow
+def test_a_template_has_the_fingers_that_its_scan_lacks(person, without_a_finger_tip):
+    scan, tip = without_a_finger_tip
+    # the synthetic people's fingers are thinner than those of scans
+    config = TemplateConfig(thinnest=0.003)
+    made = template_of_scan(scan, 8000, config, person=person)
+    assert Surface(made.mesh).closest(tip[None]).distances[0] < 0.008
+    assert any("piece" in note for note in made.notes)
+    assert Surface(template_of_scan(scan, 8000, config).mesh).closest(tip[None]).distances[0] > 0.015
+
+
+def test_a_strip_between_two_borders_closes_a_tube():
+    # a tube of two rings, cut in the middle: the borders run in opposite directions
+    angle = np.arange(12) * np.pi / 6
+    ring = np.stack([np.cos(angle), np.sin(angle), 0 * angle], axis=1)
+    points = np.concatenate([ring, ring[::2] + [0, 0, 1]])
+    strip = bridge(points, np.arange(12), 12 + np.arange(6)[::-1])
+    assert len(strip) == 18
+    mesh = Mesh(points, strip)
+    assert mesh.is_edge_manifold and len(mesh.boundary_loops) == 2
+    # all faces look inward, or all outward
+    out = np.einsum("fd,fd->f", mesh.face_normals[:, :2], mesh.corners.mean(axis=1)[:, :2])
+    assert (out > 0).all() or (out < 0).all()
+
+
+def test_a_body_on_the_scan_keeps_its_fingers(person):
+    size = float(np.sqrt(person.face_areas.sum()))
+    scan = person.sample(20_000, np.random.default_rng(0))[0]
+    fit = register(person, scan, start=person.vertices)
+    assert covers(person, scan, size) and set(fit.energies) == {"strain"}        # no graph was fitted
+    tips = person.vertices[[landmarks()[f"{side} middle finger"] for side in ("left", "right")]]
+    # the points are 10 mm apart
+    assert Surface(fit.mesh).closest(tips).distances.max() < 0.010
+    # a body beside the scan is brought there by the graph first
+    assert not covers(person, scan + [0, 0.05, 0], size)
+
+
+def test_shares_of_a_surface_do_not_depend_on_how_densely_it_was_sampled(person):
+    low = person.vertices[:, 2] < np.median(person.vertices[:, 2])
+    cloud = person.sample(20_000, np.random.default_rng(1))[0]
+    below = cloud[:, 2] < np.median(person.vertices[:, 2])
+    dense = np.concatenate([cloud, person.sample(20_000, np.random.default_rng(2))[0]])
+    dense = dense[np.r_[np.ones(20_000, bool), dense[20_000:, 2] < np.median(person.vertices[:, 2])]]
+    areas, denser = point_areas(cloud), point_areas(dense)
+    share = person.share_of_area(low)
+    assert below @ areas / areas.sum() == pytest.approx(share, abs=0.02)
+    there = dense[:, 2] < np.median(person.vertices[:, 2])
+    assert there.mean() > share + 0.1 and there @ denser / denser.sum() == pytest.approx(share, abs=0.03)
