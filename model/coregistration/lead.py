@@ -98,7 +98,7 @@ def model_lead(template: Mesh, through: str, progress: Callable[[int, int], None
 
 
 def person_on(scan: Mesh | np.ndarray) -> tuple[Mesh, dict[str, int]] | None:
-    """Find the built-in people's body on a scan, see `scanprep.registration.lead.find_person`."""
+    """Find the built-in people's body on a scan, see `scanprep.registration.lead.find_scanned_person`."""
     model = model_at(BUILT_IN)
     points = scan.vertices if isinstance(scan, Mesh) else scan
     # the search takes seconds: ask it only where the scan is as large as people are

@@ -83,7 +83,7 @@ def learn_model(template: Mesh, skeleton: Skeleton, poses: np.ndarray, shapes: n
     _load_entry_point("learn", "a model of this set")(template, skeleton, poses, shapes, path)
 
 
-def find_person(scan: Mesh | np.ndarray) -> tuple[Mesh, dict[str, int]] | None:
+def find_scanned_person(scan: Mesh | np.ndarray) -> tuple[Mesh, dict[str, int]] | None:
     """Find the person on a scan with the built-in people.
 
     Parameters

@@ -35,7 +35,7 @@ from ..geometry.landmarks import landmarks_beside, read_landmark_vertices, read_
 from ..geometry.mesh import Mesh, template_problem
 from ..judgement import Judgement
 from ..ranges import Faces
-from ..registration.lead import find_person
+from ..registration.lead import find_scanned_person
 from ..repair.hole_filling import FillConfig, FilledHole, fill_holes, fill_report, filling_judgement
 from ..repair.manifold import repair
 from ..words import number_of
@@ -84,7 +84,7 @@ def template(scans: ScansArg, output: Output, faces: Faces = 14000, landmarks: P
         surface = scan if isinstance(scan, Mesh) else scan.points
         places = {} if path is None else read_landmarks(path, surface, unit)
         with bar("making the template") as progress:
-            person = find_person(surface)
+            person = find_scanned_person(surface)
             done = template_of_scan(scan, faces, landmarks=np.array(list(places.values())) if places else None,
                                     progress=progress, person=None if person is None else person[0])
         if person is not None and not places:
