@@ -30,7 +30,7 @@ ROOMS = {
         "decimation": "adapters geometry skeleton", "fusion": "geometry repair", "synthetic": "geometry skeleton",
         "alignment": "fusion geometry",
         "registration": "alignment cleaning correspondence geometry skeleton synthetic",
-        "surfaces": "adapters alignment cleaning decimation fusion geometry repair skeleton",
+        "surfaces": "adapters alignment cleaning decimation fusion geometry registration repair skeleton",
         "viewer": "alignment batch depth_camera geometry pictures registration",
         "pipeline": "batch cleaning correspondence geometry pictures registration skeleton synthetic viewer"},
     "model": {

@@ -95,7 +95,8 @@ def take_clutter(scan: Mesh | np.ndarray) -> tuple[Mesh | np.ndarray, float]:
     Nothing is removed if more than 20% would go, or if it may be a second person. The user should decide then.
     """
     try:
-        cleaned = clean_scan(scan)
+        # a piece within 25 cm is no clear clutter: a forearm, where one camera did not see the upper arm
+        cleaned = clean_scan(scan, CleanScanConfig(gap=0.25))
     except ValueError:                 # nothing would be left
         return scan, 0.0
     removed = 1 - float(cleaned.kept.mean())

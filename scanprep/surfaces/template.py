@@ -5,7 +5,6 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
-import igl
 import numpy as np
 from scipy.spatial import cKDTree
 
@@ -178,6 +177,8 @@ def _finish(mesh: Mesh, faces: int, config: TemplateConfig, progress: Callable[[
     rounds = min(config.smoothing, round(config.smoothing * (config.merge.voxel / mesh.mean_edge)**2))
     scanned = mesh = smooth_taubin(mesh, rounds)                        # smooth borders give fair patches
     if person is not None:
+        import igl
+
         # triangles of a sixteenth, as fine as those of a scan
         fine = Mesh(*igl.upsample(np.array(person.vertices), np.array(person.faces), 2))
         mesh, pieces = graft(mesh, close(mesh, config.fill), fine)
