@@ -232,10 +232,13 @@ def test_left_and_right_are_swapped_and_back(folder):
     app = app_of(folder)
     with pytest.raises(ValueError, match="names a side"):
         sent(app, "swap")
+    app.scans[0].places = {"navel": np.zeros(3)}
+    assert not app.greet()[-1].fields["can_swap"]
     app.scans[0].places = {"left toe": np.array([1.0, 0, 0]), "right toe": np.array([-1.0, 0, 0]),
                            "left knee": np.array([1.0, 0, 1]), "navel": np.zeros(3)}
     before = dict(app.scans[0].places)
     app.scans[0].predicted = {"left heel": np.array([1.0, 0, 0]), "nose tip": np.ones(3)}
+    assert app.greet()[-1].fields["can_swap"]
     sent(app, "swap")
     after = app.scans[0].places
     assert set(app.scans[0].predicted) == {"right heel", "nose tip"}

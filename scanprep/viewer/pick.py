@@ -119,7 +119,8 @@ class PickApp:
                 "scan": self.current,
                 "scans": [{"name": one.path.name, "count": len(one.places)} for one in self.scans],
                 "undo": bool(self.done), "redo": bool(self.undone), "working": self.working, "question": self.question,
-                "pair": self._pair(), "can_predict": self._can_predict(), **self.more()}, latest="state")
+                "pair": self._pair(), "can_swap": self.scan is not None and any(map(other_side, self.scan.places)),
+                "can_predict": self._can_predict(), **self.more()}, latest="state")
 
     def _pair(self) -> str | None:
         """Return the landmark of the other side, where the scan has the chosen one and that."""

@@ -98,6 +98,7 @@ export class Pick extends Program {
     this.buttons.confirm.disabled = !waiting;
     this.buttons.confirm.textContent = waiting ? `confirm ${waiting} predicted` : "confirm all";
     this.buttons.predict.disabled = !state.can_predict || Boolean(state.working);
+    this.buttons.swap.disabled = !state.can_swap;
     this.buttons.pair.disabled = !state.pair;
     this.buttons.pair.textContent = state.pair ? `exchange with ${state.pair}` : "exchange the pair";
     this.buttons.next.disabled = state.names.length < 2;
