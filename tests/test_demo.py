@@ -1,9 +1,13 @@
-"""The demonstration: figures against the ground truth, a page that stands alone, and nothing done twice."""
+"""The demonstration: figures against the ground truth, a page that stands alone, and nothing done twice.
+
+Figures are those of `scape demo --quick`; all else is tested on a demonstration that is as small as it can be.
+"""
 import json
 import re
 import shutil
 import subprocess
 import sys
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -15,10 +19,9 @@ from quiet_pictures import coarse_pictures
 from scene_reader import scenes_of
 
 from completion import Motion
-from completion.demo import chain
+from completion.demo import chain, cli
 from completion.demo import figures as measuring
 from completion.demo.chain import QUICK, Demo, DemoConfig
-from completion.demo.cli import demo
 from completion.viewing.files import Files
 from model import load_model
 from scanprep import RegisteredSet, console
@@ -29,19 +32,54 @@ from scanprep.geometry.files import read_mesh, write_mesh
 from scanprep.geometry.mesh import template_problem
 from scanprep.geometry.surface import Surface
 from scanprep.pipeline.mend import MendApp
-from scanprep.pipeline.prepare import PrepareConfig
-from scanprep.skeleton.find import find_skeleton
+from scanprep.pipeline.prepare import PrepareConfig, prepare
+from scanprep.pipeline.scan import ScanSettings
+from scanprep.registration import person
+from scanprep.registration.schedule import RegistrationConfig
+from scanprep.skeleton.find import SkeletonConfig, find_skeleton
 from scanprep.surfaces.cli import template
 from scanprep.synthetic.data_set import SUBJECT, subject_pose
 from scanprep.synthetic.people import SyntheticPerson
 
-CHILD = 0.45                       # the size of a person whose views are merged quickly
+CHILD = 0.25                       # the size of a person whose views are merged quickly
 pytestmark = pytest.mark.timeout(600)
+# a demonstration of four scans, few triangles, few nodes and rounds, whose errors nobody measures
+SMALL = replace(QUICK, poses=3, subjects=1, faces=2000, resolution=0.02, template_resolution=0.015, held_out=1)
+FEW_STEPS = PrepareConfig(
+    ScanSettings(RegistrationConfig(tuple(replace(stage, nodes=min(stage.nodes, 100), rounds=2, ends=0)
+                                          for stage in RegistrationConfig().graph)), through="none"),
+    SkeletonConfig(restarts=1, patches=40), min_poses=3)
+
+
+@contextmanager
+def small():
+    """`scape demo --quick` is the small one; its template is not sought for the parts of a person."""
+    def few_steps(tasks, template, landmarks, folder, _, *rest):
+        return prepare(tasks, template, landmarks, folder, FEW_STEPS, *rest)
+
+    with coarse_pictures(), pytest.MonkeyPatch.context() as patch:
+        patch.setattr(cli, "QUICK", SMALL)
+        patch.setattr(chain, "prepare", few_steps)
+        patch.setattr(person, "_person_on", lambda *given: None)
+        yield
+
+
+@pytest.fixture(scope="module")
+def small_demo(tmp_path_factory):
+    """The folder of the small demonstration; nothing is written in it."""
+    folder = tmp_path_factory.mktemp("small") / "scape_demo"
+    with small():
+        assert run(cli.demo, "scape demo", ["--quick", "--output", str(folder)]) == 0
+    return folder
+
+
+def metrics(folder):
+    return {m["metric"]: m["value"] for m in json.loads((folder / "report.json").read_text())["metrics"]}
 
 
 @pytest.fixture(scope="module")
 def figures(demo_folder):
-    return {m["metric"]: m["value"] for m in json.loads((demo_folder / "report.json").read_text())["metrics"]}
+    return metrics(demo_folder)
 
 
 def figure(figures, start):
@@ -50,12 +88,14 @@ def figure(figures, start):
     return found[0]
 
 
+@pytest.mark.slow
 def test_registration_is_near_the_truth(figures):
     assert figure(figures, "registration: 11 scans, mean distance to the true surface") < 1.5
     assert figure(figures, "registration: the same, worst scan") < 2.0
     assert figure(figures, "points registered beside their true place") < 10.0
 
 
+@pytest.mark.slow
 def test_skeleton_is_that_of_the_body(figures, demo_folder):
     """The parts that exports hang on have their names, and the walk goes out under the bone names of a game engine."""
     assert set(load_model(demo_folder / "model.npz").skeleton.names) >= NEEDED
@@ -74,6 +114,7 @@ def light_person():
     return whole, few.template, few.vertex_map
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(5))
 def test_every_seed_of_the_default_demo_finds_the_parts_by_name(light_person, seed):
     """Its poses as registration leaves them, some millimetres along the skin: the search is that of `prep run`."""
@@ -99,6 +140,7 @@ def slid_poses(mesh, poses, size, rng):
                      for body, slide in zip(posed, slides, strict=True)])
 
 
+@pytest.mark.slow
 def test_more_of_the_first_component_is_more_volume(demo_folder):
     model = load_model(demo_folder / "model.npz")
     rest = np.zeros((len(model.skeleton.parents), 3))
@@ -106,8 +148,8 @@ def test_more_of_the_first_component_is_more_volume(demo_folder):
     assert volumes[0] < volumes[1] < volumes[2]
 
 
-def test_range_views_and_cameras_make_a_template(demo_folder, tmp_path):
-    views = demo_folder / "template_scan" / "range_views"
+def test_range_views_and_cameras_make_a_template(small_demo, tmp_path):
+    views = small_demo / "template_scan" / "range_views"
     cameras = json.loads((views / "cameras.json").read_text())
     assert set(cameras) == {path.stem for path in views.glob("*.ply")}
     for name in cameras:                                                # of a child, who is merged quickly
@@ -120,6 +162,7 @@ def test_range_views_and_cameras_make_a_template(demo_folder, tmp_path):
     assert template_problem(read_mesh(tmp_path / "t.ply")) is None
 
 
+@pytest.mark.slow
 def test_one_number_for_one_thing(figures, demo_folder):
     """The worst scan is as far from the truth on the page as in the report; the verdict stands before all figures."""
     page = (demo_folder / "report.html").read_text(encoding="utf-8")
@@ -129,6 +172,7 @@ def test_one_number_for_one_thing(figures, demo_folder):
     assert 0 < page.index('<p class="verdict good">') < page.index("<table>")
 
 
+@pytest.mark.slow
 def test_model_and_completion_and_animation(figures):
     assert figure(figures, "model: 2 poses it never saw") < 12.0
     assert figure(figures, "completion, seen: ") < 3.0
@@ -136,6 +180,7 @@ def test_model_and_completion_and_animation(figures):
     assert figure(figures, "animation: mean error") < 15.0
 
 
+@pytest.mark.slow
 def test_outputs_are_whole(demo_folder):
     whole = RegisteredSet.load(demo_folder / "set")
     assert template_problem(whole.template) is None and whole.template.is_closed
@@ -146,28 +191,29 @@ def test_outputs_are_whole(demo_folder):
     assert len(motion.poses) == 66 and np.isfinite(motion.poses).all()
 
 
-def test_its_motion_opens_and_its_set_can_be_mended(demo_folder):
+def test_its_motion_opens_and_its_set_can_be_mended(small_demo, tmp_path):
     """By themselves, as those of `scape animate` and `scape prep run`; nothing has to be registered again."""
-    entry, = Files((demo_folder / "animation",)).entries()
+    folder = shutil.copytree(small_demo, tmp_path / "demo")             # the app writes beside the set
+    entry, = Files((folder / "animation",)).entries()
     assert entry.load().shapes
-    app = MendApp(demo_folder / "set")
-    assert len(app.scans) == 11 and not app.changed
+    app = MendApp(folder / "set")
+    assert len(app.scans) == 4 and not app.changed
 
 
-def test_page_stands_alone(demo_folder):
-    page = (demo_folder / "report.html").read_text(encoding="utf-8")
+def test_page_stands_alone(small_demo):
+    page = (small_demo / "report.html").read_text(encoding="utf-8")
     assert not re.findall(r'(?:src|href)="(?!data:|#)[^"]*"', page)
     scenes = scenes_of(page)
     assert len(scenes) == 9 and len(page) < 4_000_000 and "animation/walk.glb" in page
     assert scenes[-1].layer("body")["motion"]["frames"] == 66
     for stage in ("Scans", "Template", "Registration", "Skeleton", "Body shape", "Completion", "Animation"):
         assert re.search(rf"<h2[^>]*>{stage}</h2>", page)
-    assert (demo_folder / "animation" / "walk.glb").read_bytes()[:4] == b"glTF"
+    assert (small_demo / "animation" / "walk.glb").read_bytes()[:4] == b"glTF"
 
 
-def test_every_figure_of_the_page_turns(demo_folder, new_page):
+def test_every_figure_of_the_page_turns(small_demo, new_page):
     page = new_page(offline=True)
-    page.goto((demo_folder / "report.html").as_uri())
+    page.goto((small_demo / "report.html").as_uri())
     figures = page.locator("figure[data-scene]")
     for number in range(figures.count()):
         figures.nth(number).scroll_into_view_if_needed()
@@ -175,10 +221,10 @@ def test_every_figure_of_the_page_turns(demo_folder, new_page):
     assert not page.errors and len(page.requests) == 1
 
 
-def test_goes_on_where_it_was(demo_folder, tmp_path, figures):
+def test_goes_on_where_it_was(small_demo, tmp_path):
     """Without the model and the page, a second run makes these again, the same, and touches nothing before them."""
     folder = tmp_path / "again"
-    shutil.copytree(demo_folder, folder)
+    shutil.copytree(small_demo, folder)
     (folder / "model.npz").unlink()
     (folder / "report.html").unlink()
 
@@ -187,11 +233,11 @@ def test_goes_on_where_it_was(demo_folder, tmp_path, figures):
         return {p: p.stat().st_mtime_ns for p in kept}
 
     before = touched()
-    with coarse_pictures():                                             # as the first time
-        assert run(demo, "scape demo", ["--quick", "--output", str(folder)]) == 0
+    with small():                                                       # as the first time
+        assert run(cli.demo, "scape demo", ["--quick", "--output", str(folder)]) == 0
     assert before == touched()
-    assert files(folder, "report.json") == files(demo_folder, "report.json")
-    again = {m["metric"]: m["value"] for m in json.loads((folder / "report.json").read_text())["metrics"]}
+    assert files(folder, "report.json") == files(small_demo, "report.json")
+    figures, again = metrics(small_demo), metrics(folder)
     same = [name for name in figures if name != "time"]
     assert {name: again[name] for name in same} == {name: figures[name] for name in same}
 
@@ -202,8 +248,8 @@ def files(folder, *but):
 
 
 @pytest.fixture
-def counted(monkeypatch):
-    """Calls of the long stages after the scans."""
+def counted():
+    """Calls of the long stages after the scans, of the small demonstration."""
     calls = {name: 0 for name in ("make_template", "prepare", "learn_scape", "complete", "record_walk", "animate")}
 
     def count(name, real):
@@ -212,18 +258,19 @@ def counted(monkeypatch):
             return real(*given, **named)
         return counting
 
-    for name in calls:
-        monkeypatch.setattr(chain, name, count(name, getattr(chain, name)))
-    return calls
+    with small(), pytest.MonkeyPatch.context() as patch:
+        for name in calls:
+            patch.setattr(chain, name, count(name, getattr(chain, name)))
+        yield calls
 
 
-def test_another_setting_does_anew_what_depends_on_it(demo_folder, tmp_path, counted):
+def test_another_setting_does_anew_what_depends_on_it(small_demo, tmp_path, counted):
     """Another rate of the markers: another recording and another motion, and nothing else."""
     folder = tmp_path / "again"
-    shutil.copytree(demo_folder, folder)
+    shutil.copytree(small_demo, folder)
     before = files(folder)
     with workspace(folder) as space:
-        measuring.measure_demo(Demo(space, replace(QUICK, rate=33.0), console.bar))
+        measuring.measure_demo(Demo(space, replace(SMALL, rate=33.0), console.bar))
     changed = {name for name, data in files(folder).items() if before[name] != data}
     done = {name: calls for name, calls in counted.items() if calls}
     # `prepare` looks for itself what is to be done
@@ -276,7 +323,7 @@ def test_a_set_with_more_scans_becomes_one_with_fewer(tmp_path, monkeypatch):
 def test_a_bad_seed_leaves_the_folder_as_it_was(tmp_path, capsys):
     scans(tmp_path / "a", TINY)
     before = files(tmp_path / "a")
-    assert run(demo, "scape demo", ["--quick", "--seed", "-1", "--output", str(tmp_path / "a")]) in (1, 2)
+    assert run(cli.demo, "scape demo", ["--quick", "--seed", "-1", "--output", str(tmp_path / "a")]) in (1, 2)
     assert "seed" in capsys.readouterr().err
     assert files(tmp_path / "a") == before
     scans(tmp_path / "a", TINY)
@@ -285,7 +332,7 @@ def test_a_bad_seed_leaves_the_folder_as_it_was(tmp_path, capsys):
 
 def test_what_is_not_ours_stays(tmp_path, capsys):
     (tmp_path / "report.html").write_text("mine")
-    assert run(demo, "scape demo", ["--quick", "--output", str(tmp_path)]) == 1
+    assert run(cli.demo, "scape demo", ["--quick", "--output", str(tmp_path)]) == 1
     assert "report.html" in capsys.readouterr().err and [p.name for p in tmp_path.iterdir()] == ["report.html"]
 
 

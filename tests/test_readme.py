@@ -4,6 +4,7 @@ The other documents are shared out over `test_readme_scans.py`, `test_readme_mod
 so that processes share the work; `readme_folder.PARTS` says who runs which.
 """
 import re
+import shlex
 
 import pytest
 from readme_folder import (
@@ -21,6 +22,9 @@ from readme_folder import (
     user_folder,
 )
 from readme_user import of_a_user
+
+from completion.__main__ import COMMANDS
+from scanprep.command_line import Arguments, list_commands, load_command
 
 pytestmark = pytest.mark.timeout(1800)
 
@@ -48,12 +52,25 @@ def test_set_up_is_what_ci_does():
     assert 'pip install --quiet ".[test]"' in ci and '\npytest -m "slow or not slow"\n' in ci
 
 
+def test_every_command_of_the_documents_is_understood():
+    """Flags, kinds of values and ranges; what the commands make is looked at when they run, which takes minutes."""
+    known = list_commands(COMMANDS, "scape")
+    for part in (*PARTS, REST):
+        for line in commands_of_part(part):
+            words = shlex.split(line)
+            path = next(path for k in (2, 3) if (path := " ".join(words[:k])) in known)
+            words = words[len(path.split()):]
+            Arguments(load_command(known[path]), path, words).read(words)
+
+
+@pytest.mark.slow
 def test_commands(place):
     for written in ("out/report.html", "completed/report.html", "walk/animation.glb", "walk.glb", "measures.csv",
                     "heavier.ply", "set/report.html", "evaluation/report.html", "he.ply"):
         assert (place / written).exists(), written
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("document, code", snippets_of_part("start"))
 def test_snippets(there, place, document, code):
     run_snippet(document, code)

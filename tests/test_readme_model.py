@@ -12,7 +12,7 @@ from readme_folder import (
 from readme_user import of_a_user
 
 SCANS = ["subject_00_rest", "subject_01_kick_left", "person_00_female"]              # of one folder: two people
-pytestmark = pytest.mark.timeout(1800)
+pytestmark = [pytest.mark.slow, pytest.mark.timeout(1800)]
 
 
 @pytest.fixture(scope="module")

@@ -3,7 +3,7 @@ import pytest
 from readme_folder import commands_of_part, run_command, run_snippet, snippets_of_part, user_folder
 from readme_user import of_a_user
 
-pytestmark = pytest.mark.timeout(1800)
+pytestmark = [pytest.mark.slow, pytest.mark.timeout(1800)]
 
 
 @pytest.fixture(scope="module")
