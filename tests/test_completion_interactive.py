@@ -151,8 +151,10 @@ def test_too_few_landmarks_and_nothing_to_save_are_refused(case):
 def test_a_dropped_scan_is_completed_beside_the_others(case, tmp_path):
     _, points, _, app = case
     write_points(tmp_path / "drop.ply", PointCloud(points + 1.0))
+    opened = app.greet()[0].fields["opened"]
     app.receive("drop.ply", tmp_path / "drop.ply", lambda message: None)
     assert app.scan.path.name == "drop.ply" and len(app.scans) == 2
+    assert app.greet()[0].fields["opened"] == opened + 1                   # so that the page shows the whole of it
     assert app.scan.file.parent == app.output and app.scan.path.parent != tmp_path
     (tmp_path / "broken.ply").write_bytes(b"ply\nnothing")
     with pytest.raises(ValueError, match=r"broken\.ply"):

@@ -23,7 +23,6 @@ export class Pick extends Program {
     this.drags = Date.now() % 1e9;                      // of other tabs' numbers too
     this.inside = false;
     this.state = null;
-    this.measured = [];
     this.on("state", (fields) => this.update(fields));
     this.build();
     this.onWindow("keydown", (event) => this.key(event));

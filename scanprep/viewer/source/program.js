@@ -77,7 +77,6 @@ export class Program {
   }
 
   connected(state) {
-    this.element ??= document.body;
     document.body.dataset.connection = state;
     if (state === "lost") this.say("The connection is lost; what you do is kept and sent when it is back.", "bad");
     if (state === "refused") this.say("This page was refused: start the program again and use the address that it prints.", "bad");
