@@ -100,7 +100,7 @@ def drop_rounds(space: Workspace, name: str) -> None:
 
 
 def drop_round(space: Workspace, number: int, names: Collection[str]) -> None:
-    """Remove the registrations of some scans in a round, and its model if no other scan used it.
+    """Remove the registrations of some scans in a round, and its model and lead if no other scan used them.
 
     Scans of earlier calls, which are not among the names, keep theirs.
     """
@@ -109,6 +109,7 @@ def drop_round(space: Workspace, number: int, names: Collection[str]) -> None:
         space.drop(prefix + name)
     if not space.list_results(prefix):
         space.drop(f"model {number}")
+        space.drop(f"lead {number}")
 
 
 def bootstrap_set(space: Workspace, work: RegisterScan, tasks: Sequence[ScanTask], first: Mapping[str, ScanFigures],
@@ -161,7 +162,8 @@ def bootstrap_set(space: Workspace, work: RegisterScan, tasks: Sequence[ScanTask
         model = space.folder / model_file
         teach = partial(_teach, model_file, work, skeleton, lessons)
         space.step(f"model {number}", (work.template, work.parts, skeleton, lessons), teach)
-        lead = lead_of(work.template, str(model))
+        lead = space.step(f"lead {number}", (work.template, model),
+                          lambda folder, model=model: lead_of(work.template, str(model)))
         assert lead is not None, "a model was named"
         again = RegisterAgain(replace(work, lead=replace(lead, name=lead_name)), number)      # type: ignore[type-var]
         # register the doubted scans through it

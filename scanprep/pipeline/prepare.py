@@ -181,11 +181,13 @@ def _set_up(space: Workspace, tasks: Sequence[ScanTask], template: Mesh, templat
     """Prepare the work on each scan of a set, and the scans with the model that leads the template to them."""
     # a fresh copy without cached properties, as it is sent to the workers
     bare = Mesh(template.vertices, template.faces, template.colors)
-    parts = space.step("person", bare, lambda folder: person_parts(bare, progress))
     tasks = name_model(tasks, config)
     lead = _lead(space, bare, tasks, config.scan.through, progress)
-    return RegisterScan(bare, {name: int(v) for name, v in template_landmarks.items()}, config.scan,
-                        parts if lead is None else parts or lead.parts, lead), tasks
+    # a model of people that lies on the template knows its parts; else the average person is registered to it
+    parts = None if lead is None else lead.parts
+    if parts is None:
+        parts = space.step("person", bare, lambda folder: person_parts(bare, progress))
+    return RegisterScan(bare, {name: int(v) for name, v in template_landmarks.items()}, config.scan, parts, lead), tasks
 
 
 def name_model(tasks: Sequence[ScanTask], config: PrepareConfig) -> list[ScanTask]:
