@@ -14,6 +14,7 @@ import typing
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
+from shlex import quote
 from typing import Any
 
 from . import config_files, ranges
@@ -75,7 +76,7 @@ def run(function: Callable[..., Outcome], prog: str, argv: list[str]) -> int:
     if outcome.output is not None:
         say(call.real(f"written: {outcome.output}" + (f" (figures in {report})" if report else "")))
     if outcome.following and not failed:
-        say(f"next: {call.real(outcome.following)}")
+        say(f"next: {call.real(outcome.following, quote)}")
     for failure in outcome.failures:
         say(call.real(f"{prog}: failed: {call.arguments.as_flags(failure)}"))
     return 1 if outcome.failures or failed else 0
@@ -213,10 +214,15 @@ class _Call:
         """Return whether the same command resumes after an interruption."""
         return self.in_folder or (self.arguments.beside and not self.arguments.either)
 
-    def real(self, text: str) -> str:
-        """Return a message with the output's path in place of the temporary folder's."""
+    def real(self, text: str, as_shown: Callable[[str], str] = str) -> str:
+        """Return a message with the output's path, written `as_shown`, in place of the temporary folder's."""
         staged, output = self._staged, self.output
-        return text if staged is None or output is None else text.replace(str(staged), str(output.parent))
+        if staged is None or output is None:
+            return text
+        # a path with blanks may be quoted already; then it ends at the quote
+        path = re.escape(str(staged))
+        return re.sub(rf"'{path}([^']*)'|{path}([^\s;,:]*)",
+                      lambda match: as_shown(f"{output.parent}{match[1] or match[2] or ''}"), text)
 
     def carry_out(self, start: float, notes: Sequence[str]) -> tuple[Outcome, Path | None]:
         """Run the function; return its outcome and the path of the report, which lists the notes too."""

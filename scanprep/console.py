@@ -44,7 +44,8 @@ class Outcome:
     """The result of a command: where it wrote, its figures, and what failed on the way.
 
     `judgement` says how good the result is; the files are written in any case. It is None for commands that compute
-    nothing, only show or record what the user does. `following` is the next step, in one sentence.
+    nothing, only show or record what the user does. `following` is the next step, in one sentence. `scans` are the
+    judgements on the single scans of a set, by name, for report.json.
     """
 
     output: Path | None
@@ -53,6 +54,7 @@ class Outcome:
     failures: list[str] = dataclasses.field(default_factory=list)
     judgement: Judgement | None = dataclasses.field(kw_only=True)
     following: str = ""
+    scans: Mapping[str, Judgement] = dataclasses.field(default_factory=dict)
 
 
 def details(metrics: Iterable[Metric]) -> list[Metric]:
@@ -168,6 +170,8 @@ def write_report(outcome: Outcome, command: str, seconds: float, notes: Sequence
         "settings": outcome.settings, "failures": outcome.failures, "notes": list(notes),
         "judgement": None if outcome.judgement is None else dataclasses.asdict(outcome.judgement),
         "metrics": [{"metric": m.name, "value": m.value, "unit": m.unit} for m in outcome.metrics],
+        **({"scans": [{"name": name, **dataclasses.asdict(judgement)} for name, judgement in outcome.scans.items()]}
+           if outcome.scans else {}),
         **({} if written is None else {"written": dict(written)})})
     return path
 

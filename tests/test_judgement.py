@@ -2,6 +2,7 @@
 
 The limits were chosen on real data, see the comments beside them; here is that each is heard where it belongs.
 """
+import csv
 import dataclasses
 import json
 from pathlib import Path
@@ -131,7 +132,11 @@ def test_a_scan_of_something_else_is_a_failure_of_a_set(place, capsys):
     command = "prep run scans --template template.ply -o set --through pose --workers 1 --config quick_set.toml"
     assert main(command.split()) == 1
     assert "ten.ply: the template is not on it" in capsys.readouterr().err
-    assert "ten" not in Path("set/registration.csv").read_text()
+    # the table and the report have a verdict on every scan
+    verdicts = {row["name"]: row["verdict"] for row in csv.DictReader(Path("set/registration.csv").open())}
+    told = {row["name"]: row for row in json.loads(Path("set/report.json").read_text())["scans"]}
+    assert verdicts == {name: row["verdict"] for name, row in told.items()} and set(verdicts) == {"good", "ten"}
+    assert verdicts["ten"] == "failed" and "the template is not on it" in told["ten"]["reasons"][0]
     assert "nan" not in Path("set/registration.csv").read_text() and "none" in Path("set/registration.csv").read_text()
 
 

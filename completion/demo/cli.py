@@ -3,6 +3,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from shlex import quote
 
 from scanprep.arguments import UsageError
 from scanprep.batch.workspace import Workspace
@@ -39,5 +40,5 @@ def demo(out: Out = Path("scape_demo"), quick: bool = False, full: bool = False,
     with bar("drawing the report") as progress, space.staging("page") as staged:
         write_page(run, metrics, judgement, progress, staged.folder)
     return Outcome(out, metrics, {"demo": run.config, "model": MODEL}, judgement=judgement,
-                   following=f"open {out / 'report.html'} in a browser; then your own scans: "
+                   following=f"open {quote(str(out / 'report.html'))} in a browser; then your own scans: "
                    "scape prep run scans --template template.ply -o set")

@@ -6,6 +6,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from pathlib import Path
+from shlex import quote
 
 import numpy as np
 
@@ -86,7 +87,7 @@ def write_sample(out: Out = Path("sample")) -> Outcome:
     return Outcome(out, [Metric("scans", len(SCANS)), Metric("women on them", sexes.count("female")),
                          Metric("men on them", sexes.count("male")), Metric("frames of the walk", len(poses)),
                          Metric("markers on the walker", len(walk.labels))],
-                   judgement=Judgement.of(), following=f"cd {out}, then scape mosh walk.c3d -o out")
+                   judgement=Judgement.of(), following=f"cd {quote(str(out))}, then scape mosh walk.c3d -o out")
 
 
 def scan_to_file(folder: Path, one: SampleScan, person: SyntheticPerson, seed: int) -> None:

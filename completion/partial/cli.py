@@ -3,6 +3,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from shlex import quote
 from typing import Annotated, Literal
 
 from scanprep.arguments import Place, UsageError
@@ -87,8 +88,8 @@ def complete_scan(scans: ScansArg = (), *, output: Output, model: ModelOrNone = 
     if inputs.landmarks is None:
         say("note: no landmarks; the search starts from typical poses, look at report.html for limbs mixed up")
     return do_one("completing", space, work, Task("completion", inputs), {"complete": config, "model": name},
-                  f"open {output / 'report.html'}, then scape measure {output} -m {model or 'MODEL.npz'} "
-                  "-o measures.csv")
+                  f"open {quote(str(output / 'report.html'))}, then scape measure {quote(str(output))} "
+                  f"{'' if model is None else f'-m {quote(str(model))} '}-o measures.csv")
 
 
 def _mend(call: FolderCall, space: Workspace) -> Outcome:

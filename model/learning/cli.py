@@ -5,6 +5,7 @@ import dataclasses
 import warnings
 from collections.abc import Mapping
 from pathlib import Path
+from shlex import quote
 from typing import Annotated, Literal
 
 import numpy as np
@@ -20,6 +21,7 @@ from scanprep.geometry.files import list_meshes, name_of
 from scanprep.geometry.landmarks import read_landmark_vertices
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.tables import read_table
+from scanprep.judgement import carry_judgements
 from scanprep.registration.person import has_limbs
 from scanprep.skeleton.names import note_numbered_parts
 from scanprep.skeleton.roles import joint_in_words
@@ -80,6 +82,8 @@ def learn(poses: Path, output: Output, shapes: Path | None = None, template: Pat
         skinning: Settings of skinning.
         mixed: Settings of a mix.
     """
+    # what was said about the scans of the sets holds for the model; read it first, as the output may lie in a set
+    of_scans = carry_judgements([poses] if shapes is None else [poses, shapes])
     # options that exclude each other
     if kind == "mixed" and (shapes is not None or by_sex):
         raise UsageError("--kind mixed: it learns one SCAPE model of --poses alone, without --shapes and --by-sex")
@@ -135,8 +139,8 @@ def learn(poses: Path, output: Output, shapes: Path | None = None, template: Pat
         *[Metric(f"people of the {name} model", model.info["shapes"]) for name, model in models.items() if by_sex],
         *details([Metric("kind", models["neutral"].kind), Metric("triangles", len(body.faces)), *_about_steps(step)])],
                    {"scape": scape, "skinning": skinning, "mixed": mixed},
-                   judgement=judge_model(models["neutral"], people),
-                   following=f"look at it: scape view {output}")
+                   judgement=judge_model(models["neutral"], people).merge(of_scans),
+                   following=f"look at it: scape view {quote(str(output))}")
 
 
 def _about_steps(step: KeptSteps) -> list[Metric]:

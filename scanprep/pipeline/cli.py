@@ -5,6 +5,7 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from shlex import quote
 from typing import Annotated
 
 import numpy as np
@@ -90,8 +91,9 @@ def summarize(call: Call, count: int, prepared: Prepared, space: Workspace) -> O
             *_quality(verdicts), Metric("unit assumed", call.config.scan.unit or "m")]
     return Outcome(space.folder, rows, {"prepare": call.config}, list(prepared.failures),
                    judgement=judge_whole(verdicts, tree, parts=parts),
-                   following=f"open {space.folder / 'report.html'}, then "
-                   f"scape learn --poses {space.folder} --shapes {space.folder} -o model.npz")
+                   scans={verdict.name: verdict.judgement for verdict in verdicts},
+                   following=f"open {quote(str(space.folder / 'report.html'))}, then "
+                   f"scape learn --poses {quote(str(space.folder))} --shapes {quote(str(space.folder))} -o model.npz")
 
 
 def page(registered: SetArg, limits: Limits = Limits()) -> Outcome:

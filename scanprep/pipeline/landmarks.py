@@ -10,6 +10,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from pathlib import Path
+from shlex import quote
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -166,7 +167,7 @@ def write_all(tasks: Sequence[ScanTask], template: Mesh, landmarks: Mapping[str,
             Metric("unit assumed", config.scan.unit or "m")]
     return Outcome(space.folder, rows, {"prepare": config}, [*done.failures, *located.failures.values()],
                    judgement=judge_whole(list(verdicts.values()), None),
-                   following=f"open {place / 'report.html'}: scans that need a look come first")
+                   following=f"open {quote(str(place / 'report.html'))}: scans that need a look come first")
 
 
 @dataclass(frozen=True)

@@ -34,7 +34,7 @@ from ..registration.nonrigid import Registration
 from ..skeleton.names import skeleton_doubts
 from ..skeleton.tree import Skeleton
 from ..words import number_of
-from .rivals import RIVALS, doubt_rival
+from .rivals import RIVALS, doubt_rivals
 
 PICTURES, PAGE = "pictures", "report.html"     # folder and file inside the set
 WIDTH, HEIGHT = 150, 216    # pixels of one picture: five side by side fit on the page, of a standing person
@@ -96,10 +96,7 @@ def judge_set(folder: str | Path, limits: Limits | None = None) -> list[Verdict]
     figures = [f for f in read_figures(folder) if f.name in whole.names]
     verdicts = review(figures, read_failures(folder), size_of(whole.template), len(whole.template.faces), limits,
                       read_doubts(folder))
-    # where two bodies explain a scan equally well, the user has to choose
-    places = {entry.name: (folder / entry.file).parents[1] for entry in whole.entries}
-    verdicts = [doubt_rival(verdict, places.get(verdict.name, folder)) for verdict in verdicts]
-    return sorted(verdicts, key=lambda verdict: (-verdict.badness, verdict.name))
+    return doubt_rivals(verdicts, folder, whole.entries)
 
 
 def judge_whole(verdicts: Sequence[Verdict], skeleton: Skeleton | None, limits: Limits | None = None,

@@ -18,8 +18,9 @@ from ..batch.workspace import Task, Workspace
 from ..dataset import RegisteredSet, SetEntry, read_entries, write_set
 from ..geometry.landmarks import write_landmarks
 from ..geometry.mesh import Mesh, check_template
+from ..judgement import size as size_of
 from ..ranges import Count, Settings
-from ..registration.figures import ScanFigures, read_failures, write_doubts, write_failures, write_figures
+from ..registration.figures import ScanFigures, read_failures, review, write_doubts, write_failures, write_figures
 from ..registration.lead import Lead, lead_of
 from ..registration.person import person_parts
 from ..registration.schedule import RegistrationConfig
@@ -28,7 +29,7 @@ from ..skeleton.parts import SkeletonConfig
 from ..threads import one_thread
 from .bootstrap import bootstrap_set, drop_rounds, find_better_scans
 from .page import PICTURES, write_set_page
-from .rivals import RIVALS, TWO_BODIES, has_rival, load_figures, rival_file, save_figures
+from .rivals import RIVALS, TWO_BODIES, doubt_rivals, has_rival, load_figures, rival_file, save_figures
 from .scan import RegisterScan, ScanSettings, mesh_file
 from .scans import ScanTask
 
@@ -231,12 +232,16 @@ def _write_tables(space: Workspace, work: RegisterScan, tasks: Sequence[ScanTask
     entries |= {t.name: SetEntry(t.name, t.subject, t.pose, t.sex, mesh_file(t.name)) for t in tasks}
     entries |= {name: replace(entries[name], file=file) for name, (_, file) in better.items() if name in entries}
     with space.staging("tables") as staged:
-        write_set(staged.folder, work.template, [entries[name] for name in sorted(entries) if name in figures],
+        registered = [entries[name] for name in sorted(entries) if name in figures]
+        write_set(staged.folder, work.template, registered,
                   {"settings": asdict(work.settings)})
         write_landmarks(staged.folder / "landmarks.json", dict(work.landmarks))
-        write_figures(staged.folder, figures.values())
-        if work.parts is not None:
-            write_doubts(staged.folder, {name: scan_figures.doubts for name, scan_figures in figures.items()})
+        doubts = None if work.parts is None else {name: each.doubts for name, each in figures.items()}
+        if doubts is not None:
+            write_doubts(staged.folder, doubts)
+        verdicts = review([figures[entry.name] for entry in registered], failures, size_of(work.template),
+                          len(work.template.faces), doubts=doubts)
+        write_figures(staged.folder, doubt_rivals(verdicts, space.folder, registered))
         write_failures(staged.folder, failures)
     return figures
 

@@ -4,10 +4,12 @@
 """
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
 
 from ..batch.values import load_step_header, load_value, save_value
+from ..dataset import SetEntry
 from ..registration.figures import ScanFigures, Verdict
 from ..registration.limbs import PlausibilityIssue
 from ..registration.unmarked import RIVAL
@@ -46,7 +48,15 @@ def is_chosen(folder: Path, name: str) -> bool:
     return header is not None and bool(header.get(CHOSEN))
 
 
-def doubt_rival(verdict: Verdict, folder: Path) -> Verdict:
+def doubt_rivals(verdicts: Iterable[Verdict], folder: Path, entries: Iterable[SetEntry]) -> list[Verdict]:
+    """Return verdicts on the scans of a set, worst first; one more doubt where the user has to choose of two bodies."""
+    # the folder of both bodies: that of a later round, if that was better
+    places = {entry.name: (folder / entry.file).parents[1] for entry in entries}
+    doubted = [_doubt_rival(verdict, places.get(verdict.name, folder)) for verdict in verdicts]
+    return sorted(doubted, key=lambda verdict: (-verdict.badness, verdict.name))
+
+
+def _doubt_rival(verdict: Verdict, folder: Path) -> Verdict:
     """Return the verdict, with a doubt added where the scan has a rival and nobody chose."""
     if verdict.failed or not has_rival(folder, verdict.name) or is_chosen(folder, verdict.name) \
             or TWO_BODIES.words in verdict.reasons:

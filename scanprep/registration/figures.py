@@ -68,6 +68,7 @@ def read_figures(folder: Path) -> list[ScanFigures]:
     seconds = {row["name"]: float(row["seconds"]) for row in _read(folder / TIMES)}
     earlier = {"guide": "init", "flipped": "inverted"}  # column names of earlier versions
     rows = [{earlier.get(name, name): text for name, text in row.items()} for row in _read(folder / FIGURES)]
+    rows = [row for row in rows if row.get("init") != ""]       # a scan that failed has a verdict, but no figures
     try:
         return [ScanFigures(**{f.name: _READ[str(f.type)](row[f.name]) for f in _TABLED if f.name in row},
                             seconds=seconds.get(row["name"], np.nan)) for row in rows]
@@ -76,12 +77,15 @@ def read_figures(folder: Path) -> list[ScanFigures]:
                          f"({type(error).__name__}: {error})") from None
 
 
-def write_figures(folder: Path, figures: Iterable[ScanFigures]) -> None:
-    """Write the tables of figures and times, sorted by name."""
-    rows = sorted(figures, key=lambda f: f.name)
-    names = [f.name for f in _TABLED]
-    tables.write_table(folder / TIMES, ["name", "seconds"], [(f.name, f"{f.seconds:.2f}") for f in rows])
-    tables.write_table(folder / FIGURES, names, [[_as_cell(getattr(row, name)) for name in names] for row in rows])
+def write_figures(folder: Path, verdicts: Iterable[Verdict]) -> None:
+    """Write the tables of figures and times, sorted by name; a scan that failed may have a verdict alone."""
+    rows = sorted(verdicts, key=lambda verdict: verdict.name)
+    names = [f.name for f in _TABLED if f.name != "name"]
+    tables.write_table(folder / TIMES, ["name", "seconds"],
+                       [(row.name, f"{row.figures.seconds:.2f}") for row in rows if row.figures is not None])
+    tables.write_table(folder / FIGURES, ["name", *names, "verdict", "reasons"],
+                       [[row.name, *(_as_cell(getattr(row.figures, name, "")) for name in names),
+                         row.judgement.verdict, row.judgement.why] for row in rows])
 
 
 def _as_cell(value: Any) -> Any:

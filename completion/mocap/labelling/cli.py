@@ -3,6 +3,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
+from shlex import quote
 from typing import Annotated, Any
 
 import numpy as np
@@ -78,12 +79,13 @@ def label_recordings(markers: MarkersArg, output: Output, model: ModelOrNone = N
     if markers.is_dir():
         return _label_folder(markers, work, space, workers, settings)
     if not output.suffix:
-        return do_one("labelling", space, work, Task("labels", markers), settings, f"open {output / 'report.html'}")
+        return do_one("labelling", space, work, Task("labels", markers), settings,
+                      f"open {quote(str(output / 'report.html'))}")
     with bar("labelling") as report_progress:
         table, page = output.with_suffix(".labels.csv"), output.with_suffix(".report.html")
         metrics = work.write(markers, TaskContext(output.parent, report_progress=report_progress), output.name,
                              table.name, page.name)
-    return Outcome(output, metrics, settings, judgement=judgement_of(metrics), following=f"open {page}")
+    return Outcome(output, metrics, settings, judgement=judgement_of(metrics), following=f"open {quote(str(page))}")
 
 
 def _label_folder(markers: Path, work: LabelWork, space: AnyWorkspace, workers: Workers, settings: Mapping[str, Any]

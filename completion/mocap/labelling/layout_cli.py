@@ -2,6 +2,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from shlex import quote
 from typing import Annotated
 
 from model.fitting.bodies import at_rest
@@ -61,4 +62,5 @@ def find_in_recording(markers: MarkersArg, output: Output, model: ModelOrNone = 
         page.section("Left out").table(list(found.left_out.items()), ("track", "why"))
     page.section("Figures").figures(metrics).write(output.with_suffix(".report.html"))
     return Outcome(output, metrics, {"model": name}, judgement=found.judgement,
-                   following=f"look at {output.with_suffix('.png')}; then scape label --layout {output}")
+                   following=f"look at {quote(str(output.with_suffix('.png')))}; "
+                   f"then scape label --layout {quote(str(output))}")

@@ -6,6 +6,7 @@ import warnings
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from shlex import quote
 from typing import Annotated
 
 import numpy as np
@@ -115,8 +116,9 @@ def carry_out(call: MoshCall, space: Workspace, workers: Workers, command: str, 
     outcome = describe(call, loaded.name, actors).write(space, results, len(actors), lost)
     judged = [judgement_of(rows) for rows in results.values.values()]
     return replace(outcome, judgement=judged[0] if judged and len(actors) == 1 else outcome.judgement,
-                   following=f"open {space.folder / 'report.html'}; then scape view {space.folder}, which also mends "
-                   "markers")
+                   following=f"open {quote(str(space.folder / 'report.html'))}; "
+                   f"then scape view {quote(str(space.folder))}, "
+                   "which also mends markers")
 
 
 def describe(call: MoshCall, model: str, actors: Sequence[Actor]) -> FolderCommand:
