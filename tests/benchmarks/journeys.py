@@ -108,7 +108,7 @@ JOURNEYS = (
     ("measure", "template.ply", "-o", "template_measures.csv"),
     ("prep", "run", "scans", "--template", "template.ply", "--unit", "mm", "-o", "set"),
     ("learn", "--poses", "set", "--shapes", "set", "-o", "model.npz"),
-    ("model", "mesh", "model.npz", "--betas", "1.5", "-o", "heavier.ply"),
+    ("model", "mesh", "model.npz", "--betas", "1.5", "-o", "bigger.ply"),
     # 2: half a scan -> the whole body, and a measuring tape
     ("complete", "half.view.ply", "-m", "model.npz", "--subject", "template", "--unit", "mm", "-o", "completed"),
     ("measure", "completed", "-m", "model.npz", "-o", "measures.csv"),
@@ -116,7 +116,7 @@ JOURNEYS = (
     ("layout", "transfer", "cmu41", "--target", "model.npz", "-o", "layout.json"),
     ("animate", "walk.c3d", "-m", "model.npz", "--layout", "layout.json", "-o", "walk"),
     ("mosh", "walk.c3d", "-m", "model.npz", "--layout", "layout.json", "-o", "person"),
-    ("animate", "walk.c3d", "-m", "model.npz", "--layout", "layout.json", "--retarget-to", "heavier.ply", "-o",
+    ("animate", "walk.c3d", "-m", "model.npz", "--layout", "layout.json", "--retarget-to", "bigger.ply", "-o",
      "walk_of_two"),
     ("model", "export", "model.npz", "--motion", "walk/motion.npz", "--root", "pelvis", "--names", "mixamo", "--ground",
      "--fps", "30", "-o", "walk.glb"),
