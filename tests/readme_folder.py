@@ -1,9 +1,9 @@
 """The files that the documents name, in a folder of a user, and the commands and snippets that use them."""
 import json
+import os
 import re
 import shlex
 import shutil
-from dataclasses import replace
 from pathlib import Path
 from unittest.mock import patch
 from urllib.parse import quote
@@ -12,7 +12,7 @@ from urllib.request import urlopen
 import pytest
 from readme_user import of_a_user
 
-from completion import Motion, read_markers, write_markers
+from completion import Motion
 from completion.__main__ import main
 from model import load_model, write_body_npz
 from scanprep import RegisteredSet, write_mesh
@@ -27,7 +27,7 @@ ROOT = Path(__file__).parents[1]
 README = "README.md"
 # Which documents each test file runs, in this order. Those of one file use what the commands before them wrote.
 PARTS = {
-    "start": (README, "index", "tasks/researcher", "tasks/anthropometrist"),
+    "start": (README, "index", "tasks/researcher", "tasks/anthropometrist", "tasks/biomechanist", "tasks/animator"),
     "scans": ("scanprep/README.md", "methods/registration", "methods/skeleton", "methods/scan-repair",
               "methods/correspondence"),
     "model": ("model/README.md", "methods/scape", "methods/other-models", "methods/learning-from-few-scans",
@@ -42,9 +42,12 @@ SETTINGS = "quicker.toml"
 QUICKER = {
     "scape statue fit": "--size 512",
     "scape prep skeleton": "restarts = 1",
-    "scape learn --poses set --shapes set --kind": "--skeleton set/skeleton.json"}       # that of README seeks one
-QUICK = "scape model mesh", "scape complete half_view.ply -m model.npz -o", "scape animate"      # a few seconds
-SET_UP = {"pip install . && scape demo", 'pip install ".[test]" && pytest'}
+    "scape learn --poses set --shapes set --kind": "--skeleton set/skeleton.json"}
+# what the pages about methods find in the folder, made with the model of the demonstration
+MADE_BEFORE = ("scape model mesh model.npz --betas 1.5 -o bigger.ply",
+               "scape complete half_view.ply -m model.npz -o completed",
+               "scape animate walk.c3d -m model.npz --layout layout.json -o walk")
+SET_UP = {"pip install ."}
 
 
 def documents(part):
@@ -85,6 +88,9 @@ def snippets_of_part(part):
 def run_command(line):
     """One command as a user writes it."""
     words = shlex.split(line)
+    if words[0] == "cd":
+        os.chdir(words[1])
+        return
     assert words[0] == "scape", line
     words = ["own.ply" if w == "template.ply" and "views" in words else w for w in words]    # it is there already
     more = next((more for begin, more in QUICKER.items() if line.startswith(begin)), "")
@@ -108,11 +114,10 @@ def open_once(app, *_given):
         assert answer.status == 200 and b"scapekit.start" in answer.read()
 
 
-def user_folder(demo, folder, unregistered=2):
+def user_folder(demo, folder):
     """Ten scans, a template, a half view, a recording, frames of a walk, registered meshes, range views.
 
-    All scans but some are registered already, in a set that is not finished. From six of these scans comes a model
-    that loses a shin of the half view, and says so.
+    All scans are registered already, in a set that is not finished.
     """
     shutil.copytree(demo, folder / "scape_demo")
     demo = folder / "scape_demo"
@@ -129,8 +134,6 @@ def user_folder(demo, folder, unregistered=2):
                            ("half_view/half_view.landmarks.json", "half_view.landmarks.json"),
                            ("markers/layout.json", "layout.json")):
         shutil.copy(demo / source, folder / target)
-    walk = read_markers(folder / "walk.c3d")
-    write_markers(folder / "raw.c3d", replace(walk, labels=tuple(f"*{i}" for i in range(len(walk.labels)))))
     shutil.copy(demo / "scans" / f"{mine[0].split(',')[0]}.ply", folder / "standing.ply")
     shutil.copy(demo / "scans" / f"{mine[1].split(',')[0]}.ply", folder / "anna.ply")
     cameras = {}
@@ -151,8 +154,7 @@ def user_folder(demo, folder, unregistered=2):
         for row in rows:
             name = row.split(",")[0]
             write_mesh(folder / "registered" / part / f"{name}.ply", small.template.with_vertices(bodies[name]))
-    rows = [*mine[:6], *mine[7:], others[0], mine[6], others[1]]             # the last of them to be registered
-    begun_set(demo / "set", folder / "set", [row.split(",")[0] for row in rows[:len(rows) - unregistered]])
+    begun_set(demo / "set", folder / "set", [row.split(",")[0] for row in mine + others])
     return folder
 
 
@@ -182,12 +184,11 @@ def keep_scans(folder, names):
 
 
 def with_demo_model(folder):
-    """What the commands of README write: set and model are the demonstration's, which has more scans than a user."""
+    """Set and model of the demonstration, and what is made with it."""
     demo = folder / "scape_demo"
     shutil.copy(demo / "model.npz", folder / "model.npz")
     shutil.copytree(demo / "set", folder / "set", dirs_exist_ok=True)
     with of_a_user(folder):
-        for line in commands(README):
-            if line.startswith(QUICK):
-                run_command(line)
+        for line in MADE_BEFORE:
+            run_command(line)
     return folder

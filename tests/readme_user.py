@@ -24,11 +24,18 @@ def once(find):
 
 
 @contextmanager
+def work_in(folder):
+    """Work in a folder; pictures are small."""
+    with pytest.MonkeyPatch.context() as here, coarse_pictures():
+        here.chdir(folder)
+        yield
+
+
+@contextmanager
 def of_a_user(folder):
     """Work in a folder; the model of those without one is small, and so are all pictures."""
     small, load_model = with_sexes(small_people()), files.load_model
-    with pytest.MonkeyPatch.context() as here, coarse_pictures():
+    with pytest.MonkeyPatch.context() as here, work_in(folder):
         here.setattr(person, "_person_on", once(person._person_on))
-        here.chdir(folder)
         here.setattr(files, "load_model", lambda path: small if str(path) == files.BUILT_IN else load_model(path))
         yield

@@ -9,7 +9,7 @@ pytestmark = [pytest.mark.slow, pytest.mark.timeout(1800)]
 @pytest.fixture(scope="module")
 def place(demo_folder, tmp_path_factory):
     """The folder of a user who has scans, and a set that is not finished."""
-    return user_folder(demo_folder, tmp_path_factory.mktemp("readme"), unregistered=0)
+    return user_folder(demo_folder, tmp_path_factory.mktemp("readme"))
 
 
 @pytest.fixture(autouse=True)

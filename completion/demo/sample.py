@@ -17,7 +17,15 @@ from scanprep.geometry.mesh import Mesh
 from scanprep.judgement import Judgement
 from scanprep.pipeline.scans import TABLE
 from scanprep.synthetic.data_set import near_rest, stand
-from scanprep.synthetic.people import MARKERS, BodyShape, SyntheticPerson, compose_pose, find_pose, synthesise_walk
+from scanprep.synthetic.people import (
+    MARKERS,
+    NAMED_POSES,
+    BodyShape,
+    SyntheticPerson,
+    compose_pose,
+    find_pose,
+    synthesise_walk,
+)
 from scanprep.synthetic.scanner import ScannerConfig, scan
 
 from ..cli import Out
@@ -35,6 +43,7 @@ USUAL, COARSE = ScannerConfig(views=8, resolution=0.007), ScannerConfig(resoluti
 ONE_CAMERA = ScannerConfig(views=1, resolution=0.007, azimuth=-30.0)
 # an old person stands with a bent back and knees
 STOOP = compose_pose(back={"bend": 25}, neck={"nod": -12}, left_leg={"knee": 8}, right_leg={"knee": 8})
+FEET = (12, 15)                                                         # parts of a pose, after thigh and shin
 Y_UP = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])                   # many scanners write y up
 
 
@@ -93,15 +102,22 @@ def write_sample(out: Out = Path("sample")) -> Outcome:
 def scan_to_file(folder: Path, one: SampleScan, person: SyntheticPerson, seed: int) -> None:
     """Scan a person and write the file as its scanner would: a mesh, or points where the ending says so."""
     rng = np.random.default_rng(seed)
-    standing = near_rest(rng)
-    pose = {"standing": standing, "stooped": STOOP + standing}.get(one.pose)
-    body = stand(person, find_pose(one.pose) if pose is None else pose).mesh
-    seen = scan(body, one.scanner, rng).merged
+    seen = scan(stand(person, sample_pose(one.pose, rng)).mesh, one.scanner, rng).merged
     vertices = one.per_metre * (seen.vertices @ Y_UP.T if one.y_up else seen.vertices)
     if one.file.endswith(".xyz"):
         write_points(folder / one.file, PointCloud(vertices))
     else:
         write_mesh(folder / one.file, seen.with_vertices(vertices), "single")
+
+
+def sample_pose(name: str, rng: np.random.Generator) -> np.ndarray:
+    """Return the pose (16, 3) of a scan: a named one, or somebody who stands as well as people do."""
+    if name in NAMED_POSES:
+        return find_pose(name)
+    pose = near_rest(rng) + (STOOP if name == "stooped" else 0)
+    for foot in FEET:                                        # flat on the floor, whatever the leg does
+        pose[foot] = -pose[foot - 1] - pose[foot - 2]
+    return pose
 
 
 def record_markers(bodies: np.ndarray, faces: np.ndarray, rate: float, rng: np.random.Generator,
