@@ -115,7 +115,7 @@ def test_no_command_names_a_landmark():
 @pytest.mark.slow
 def test_every_result_is_good(place):
     written = [shlex.split(line)[-1] for line in commands_of_part("start")
-               if " -o " in line and not line.startswith(VIEWED)]
+               if " -o " in line and not line.startswith(VIEWED) and "measure set" not in line]
     judged = {name: verdict(place / name) for name in written}
     assert not {name: one["reasons"] for name, one in judged.items() if one["verdict"] != "good"}
 

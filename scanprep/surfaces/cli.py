@@ -98,7 +98,8 @@ def template(scans: ScansArg, output: Output, faces: Faces = 14000, landmarks: P
         if done.balance is not None:
             rows.append(Metric("triangles on the left side", 100 * done.balance, "%"))
         marks, far = carry_landmarks(places, made)
-        doubts += [f"landmark {name} is {MM * away:.0f} mm from the template" for name, away in far.items()]
+        if path is not None:            # what nobody clicked, nobody can correct: the note says how near it is
+            doubts += [f"landmark {name} is {MM * away:.0f} mm from the template" for name, away in far.items()]
     write_mesh(output, made)
     if marks:
         write_landmarks(output.with_name(f"{name_of(output)}.landmarks.json"), marks)
