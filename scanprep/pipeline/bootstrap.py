@@ -22,7 +22,7 @@ from ..geometry.farthest_points import farthest_points
 from ..geometry.files import read_mesh
 from ..judgement import size
 from ..registration.figures import UNSEEN, ScanFigures, Verdict, review
-from ..registration.lead import lead_of, learn_model
+from ..registration.lead import Lead, lead_of, learn_model
 from ..skeleton.find import find_skeleton
 from ..skeleton.parts import SkeletonConfig
 from .rivals import is_chosen
@@ -162,8 +162,7 @@ def bootstrap_set(space: Workspace, work: RegisterScan, tasks: Sequence[ScanTask
         model = space.folder / model_file
         teach = partial(_teach, model_file, work, skeleton, lessons)
         space.step(f"model {number}", (work.template, work.parts, skeleton, lessons), teach)
-        lead = space.step(f"lead {number}", (work.template, model),
-                          lambda folder, model=model: lead_of(work.template, str(model)))
+        lead = space.step(f"lead {number}", (work.template, model), partial(_lay, work.template, model))
         assert lead is not None, "a model was named"
         again = RegisterAgain(replace(work, lead=replace(lead, name=lead_name)), number)      # type: ignore[type-var]
         # register the doubted scans through it
@@ -202,6 +201,11 @@ def choose_lessons(folder: Path, tasks: Sequence[ScanTask], best: Mapping[str, V
     return Lessons(subject, tuple(places[task.name] for task in good if task.subject == subject),
                    # a single other body does not span shape differences
                    tuple(other_subjects.values()) if len(other_subjects) > 1 else ())
+
+
+def _lay(template: Mesh, model: Path, _folder: Path) -> Lead | None:
+    """Lay a learned model on the template, so that it leads to scans; nothing is written."""
+    return lead_of(template, str(model))
 
 
 def _teach(place: Path, work: RegisterScan, config: SkeletonConfig, lessons: Lessons, folder: Path) -> None:
