@@ -20,6 +20,7 @@ from ..batch.room import TaskContext
 from ..batch.workspace import Task, Workspace
 from ..geometry.farthest_points import farthest_points
 from ..geometry.files import read_mesh
+from ..geometry.mesh import Mesh
 from ..judgement import size
 from ..registration.figures import UNSEEN, ScanFigures, Verdict, review
 from ..registration.lead import Lead, lead_of, learn_model
