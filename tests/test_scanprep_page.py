@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from scanprep import RegisteredSet, Skeleton, write_landmarks, write_mesh
 from scanprep.geometry.files import PointCloud, write_points
+from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.tables import read_table
 from scanprep.judgement import Judgement
 from scanprep.pipeline import page as pictures
@@ -202,8 +203,11 @@ def test_stretches_of_a_known_map(template):
 
 
 def test_missed_points(template):
-    points = np.vstack([template.vertices * 1.001, template.vertices[:214] + [3, 0, 0]])
-    assert share_uncovered(points, template, 0.01, samples=len(points)) == pytest.approx(214 / 856)
+    # one and the same body twice, the second one 3 m away: half of the surface, though it has six vertices in seven
+    second = template.corners.reshape(-1, 3) + [3, 0, 0]
+    faces = np.concatenate([template.faces, len(template.vertices) + np.arange(len(second)).reshape(-1, 3)])
+    both = Mesh(np.concatenate([template.vertices, second]), faces)
+    assert share_uncovered(both, template, 0.01, samples=len(both.vertices)) == pytest.approx(0.5, abs=1e-6)
 
 
 def test_tables_keep_their_numbers(tmp_path):
