@@ -134,7 +134,9 @@ def template_of_scan(scan: Mesh | PointCloud, faces: int = 14000, config: Templa
         mesh = mesh_of_cloud(PointCloud(points[kept], normals))
         notes.append("points without triangles were meshed")
     made = _finish(mesh, faces, config, progress, "the scan", landmarks, person)
-    return replace(made, notes=(*notes, *made.notes), lost=share_uncovered(mesh, made.mesh, LOST))
+    # a coarse template was asked for coarse: parts thinner than half an edge cannot be in it
+    lost = share_uncovered(mesh, made.mesh, max(LOST, 0.5 * made.mesh.mean_edge))
+    return replace(made, notes=(*notes, *made.notes), lost=lost)
 
 
 def views_without_cameras(views: Sequence[Mesh | PointCloud]) -> PointCloud:
