@@ -370,7 +370,8 @@ ELSEWHERE = {
     "test_completion_cli": ("complete",), "test_completion_measuring": ("measure",),
     "test_model_learning_cli": ("learn",), "test_completion_animate_cli": ("animate",),
     "test_completion_mosh_cli": ("mosh",), "test_completion_tracking_cli": ("track",),
-    "test_completion_layout_cli": ("layout show", "layout transfer"), "test_demo": ("demo",), "test_sample": ("sample",),
+    "test_completion_layout_cli": ("layout show", "layout transfer"), "test_demo": ("demo",),
+    "test_sample": ("sample",),
     "test_completion_label_cli": ("label", "layout find"),
     "test_completion_marker_selection_cli": ("layout design",), "test_completion_motions": ("model repose",),
     "test_model_statue_cli": ("statue fit", "statue reconstruct", "statue animate")}

@@ -73,9 +73,10 @@ def test_what_leaves_less_to_doubt_is_kept(body, scan, far):
 @pytest.mark.parametrize("far", [0.0, 4e6])
 def test_two_bodies_that_explain_a_scan_alike_are_both_kept(far):
     """An egg looks the same when it is turned round; something beside it leaves as much to doubt of both."""
-    egg, clutter = ball(), np.array([1.0, 0, 0]) + 0.01 * np.arange(6)[:, None]
+    egg, board = ball(), np.array([[1.5, 0, 0], [1.9, 0, 0], [1.9, 0.4, 0], [1.5, 0.4, 0]])
     back = egg.vertices * [-1, -1, 1]
-    scan = Mesh(np.vstack([egg.vertices, clutter]) + far, egg.faces)
+    faces = np.vstack([egg.faces, len(egg.vertices) + np.array([[0, 1, 2], [0, 2, 3]])])
+    scan = Mesh(np.vstack([egg.vertices, board]) + far, faces)
 
     class Eggs:
         name, parts = "eggs", None

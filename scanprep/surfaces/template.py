@@ -134,9 +134,15 @@ def template_of_scan(scan: Mesh | PointCloud, faces: int = 14000, config: Templa
         mesh = mesh_of_cloud(PointCloud(points[kept], normals))
         notes.append("points without triangles were meshed")
     made = _finish(mesh, faces, config, progress, "the scan", landmarks, person)
-    # a coarse template was asked for coarse: parts thinner than half an edge cannot be in it
-    lost = share_uncovered(mesh, made.mesh, max(LOST, 0.5 * made.mesh.mean_edge))
-    return replace(made, notes=(*notes, *made.notes), lost=lost)
+    return replace(made, notes=(*notes, *made.notes), lost=share_lost(mesh, made.mesh))
+
+
+def share_lost(scanned: Mesh, template: Mesh) -> float:
+    """Compute the share of a scanned surface that its template lost: that lies too far off it.
+
+    A coarse template was asked for coarse: what lies within half an edge of it could not be nearer.
+    """
+    return share_uncovered(scanned, template, max(LOST, 0.5 * template.mean_edge))
 
 
 def views_without_cameras(views: Sequence[Mesh | PointCloud]) -> PointCloud:
@@ -203,9 +209,9 @@ def _finish(mesh: Mesh, faces: int, config: TemplateConfig, progress: Callable[[
     # one side may have at most 3% more of the triangles than its area suggests
     if balance is not None and abs(balance - 0.5) > 0.03:
         # least-error collapses may spend triangles on the noise of one side; shortest-edge collapses do not, but are
-        # taken only where they cut off no finger: a tip of 2 cm is 0.0003 of the surface
+        # taken only where they cut off no hand: 0.001 of the surface are the tips of three fingers
         even = _improve(decimate(mesh, faces, replace(config.decimate, method="even")), surface, keep)
-        if share_uncovered(mesh, even, LOST) < share_uncovered(mesh, small, LOST) + 0.0002:
+        if share_lost(mesh, even) < share_lost(mesh, small) + 0.001:
             notes.append(f"{100 * balance:.0f}% of the triangles were on the left side; made even, "
                          f"{100 * (share_on_left(even) or 0.5):.0f}% are")
             small, balance = even, share_on_left(even)
