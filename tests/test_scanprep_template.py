@@ -174,9 +174,9 @@ def test_what_cannot_be_meshed_says_why(tmp_path, capsys, monkeypatch):
 
 
 def test_noise_on_one_side_does_not_draw_the_triangles_there(body):
-    """Collapses of least error left 61% of the triangles on the noisy side."""
+    """Collapses of least error left 54% of the triangles on the noisy side."""
     noise = 0.003 * np.random.default_rng(0).normal(size=(len(body.vertices), 1)) * (body.vertices[:, :1] > 0)
-    # at 4,000 triangles even collapses would cut off the fingers
-    made = template_of_scan(body.with_vertices(body.vertices + noise * body.vertex_normals), 14000)
+    # at 4,000 triangles even collapses would cut off the fingers, so they are refused there
+    made = template_of_scan(body.with_vertices(body.vertices + noise * body.vertex_normals), 10000)
     assert abs(made.balance - 0.5) < 0.02 and template_problem(made.mesh) is None
     assert any("of the triangles were on the left side; made even" in note for note in made.notes)
