@@ -52,11 +52,11 @@ def doubt_rivals(verdicts: Iterable[Verdict], folder: Path, entries: Iterable[Se
     """Return verdicts on the scans of a set, worst first; one more doubt where the user has to choose of two bodies."""
     # the folder of both bodies: that of a later round, if that was better
     places = {entry.name: (folder / entry.file).parents[1] for entry in entries}
-    doubted = [_doubt_rival(verdict, places.get(verdict.name, folder)) for verdict in verdicts]
+    doubted = [doubt_rival(verdict, places.get(verdict.name, folder)) for verdict in verdicts]
     return sorted(doubted, key=lambda verdict: (-verdict.badness, verdict.name))
 
 
-def _doubt_rival(verdict: Verdict, folder: Path) -> Verdict:
+def doubt_rival(verdict: Verdict, folder: Path) -> Verdict:
     """Return the verdict, with a doubt added where the scan has a rival and nobody chose."""
     if verdict.failed or not has_rival(folder, verdict.name) or is_chosen(folder, verdict.name) \
             or TWO_BODIES.words in verdict.reasons:
