@@ -28,9 +28,10 @@ BACK = EGG.vertices * [-1, -1, 1]                      # the egg turned round, w
 @pytest.fixture
 def call(tmp_path, monkeypatch):
     """Two scans without landmarks, an egg alone and one with something beside it; and a set of them."""
-    clutter = np.array([1.0, 0, 0]) + 0.01 * np.arange(6)[:, None]
+    board = np.array([[1.5, 0, 0], [1.9, 0, 0], [1.9, 0.4, 0], [1.5, 0.4, 0]])
+    faces = np.vstack([EGG.faces, len(EGG.vertices) + np.array([[0, 1, 2], [0, 2, 3]])])
     write_mesh(tmp_path / "scans" / "alone.ply", EGG)
-    write_mesh(tmp_path / "scans" / "beside.ply", Mesh(np.vstack([EGG.vertices, clutter]), EGG.faces))
+    write_mesh(tmp_path / "scans" / "beside.ply", Mesh(np.vstack([EGG.vertices, board]), faces))
     write_mesh(tmp_path / "template.ply", EGG)
     lead = ModelLead("eggs", np.zeros((642, 3), dtype=np.int64), np.ones((642, 3)) / 3, np.zeros(642))
     monkeypatch.setattr(ModelLead, "__call__", lambda self, scan, landmarks=None, model=None: [EGG.vertices, BACK])
