@@ -177,6 +177,7 @@ def test_a_scan_dropped_again_takes_its_place_and_keeps_its_landmarks(case, tmp_
     again.close()
 
 
+@pytest.mark.slow
 def test_from_a_half_view_to_a_saved_body_by_mouse_alone(case, new_page, tmp_path):
     body, _, seen, app = case
     app.known = True

@@ -30,7 +30,7 @@ from scanprep.geometry.tables import read_table
 def place(tmp_path_factory):
     """A folder with a recording, raw.c3d, true.c3d with its labels, and the person's betas."""
     folder = tmp_path_factory.mktemp("label")
-    _, layout, places = person(2, frames=48)
+    _, layout, places = person(2, frames=24)
     places = places.copy()
     places[10:14, 3] = np.nan
     write_markers(folder / "true.c3d", MarkerSequence(places, layout.labels, RATE))
@@ -69,6 +69,7 @@ def test_the_recording_is_labelled_and_nothing_is_lost(out):
     assert "Where it is unsure" in (out / "labelled.report.html").read_text()
 
 
+@pytest.mark.slow
 def test_corrections_come_back(out):
     """The two front markers of the head exchanged by hand, and one made none."""
     rows = [row for _, row in read_table(out / "labelled.labels.csv", ("track", "label"))]
@@ -103,6 +104,7 @@ def test_corrections_that_cannot_be_are_told(out, capsys, line, words):
     assert "bad.csv" in told and words in " ".join(told.split()) and not (out / "no.c3d").exists()
 
 
+@pytest.mark.slow
 def test_a_known_person_and_other_formats(place, capsys):
     assert run(place, "label", "raw.trc", "--layout", "cmu41", "--subject", "betas.json", "-o", "known.csv") == 0
     true, found = read_markers(place / "true.c3d"), read_markers(place / "known.csv")
@@ -110,6 +112,7 @@ def test_a_known_person_and_other_formats(place, capsys):
     assert same.mean() > 0.98
 
 
+@pytest.mark.slow
 def test_labels_that_are_there_are_believed_unless_told_otherwise(place):
     true = read_markers(place / "true.c3d")
     swapped = [{"LFHD": "RFHD", "RFHD": "LFHD"}.get(label, label) for label in true.labels]
@@ -138,6 +141,7 @@ def test_what_cannot_be_labelled_is_told(place, capsys, words, said):
     assert said in " ".join(capsys.readouterr().err.split()) and not (place / "x.c3d").exists()
 
 
+@pytest.mark.slow
 def test_animate_labels_first(place):
     assert run(place, "animate", "raw.c3d", "--unlabelled", "--layout", "cmu41", "--subject", "betas.json", "-o",
                "moving") == 0

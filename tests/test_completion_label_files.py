@@ -373,6 +373,7 @@ def animate(*words):
                  "--workers", "1"])
 
 
+@pytest.mark.slow
 def test_animate_goes_on_with_the_labels(here, monkeypatch):
     """As with the markers under their names; killed after the labels, it does not look for them again."""
     folder, knows = here

@@ -51,6 +51,7 @@ def test_no_point_has_two_labels(labelled):
         assert len(np.unique(taken)) == len(taken)
 
 
+@pytest.mark.slow
 def test_labels_do_not_depend_on_where_the_person_stands_nor_faces(one):
     subject, layout, places = one
     turn = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]]) if np.ptp(subject.template.vertices, axis=0).argmax() == 2 \
@@ -60,6 +61,7 @@ def test_labels_do_not_depend_on_where_the_person_stands_nor_faces(one):
     assert share_right(found.columns, truth) > 0.99
 
 
+@pytest.mark.slow
 def test_known_labels_are_kept(one):
     """Even wrong ones: whoever says them has to be believed."""
     subject, layout, places = one
@@ -74,6 +76,7 @@ def test_known_labels_are_kept(one):
     assert found.unlabelled[truth == first].all()
 
 
+@pytest.mark.slow
 def test_two_people_who_pass_each_other_keep_their_markers():
     (a, layout, first), (b, _, second) = person(0), person(1)
     up = np.ptp(a.template.vertices, axis=0).argmax()

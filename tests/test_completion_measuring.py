@@ -50,6 +50,7 @@ def table(path):
         return {row["body"]: row for row in csv.DictReader(lines)}
 
 
+@pytest.mark.slow
 def test_a_folder_and_betas_with_their_model(folder, tmp_path, capsys):
     """A bent body is measured as it stands upright; the page and the report are there, the values those of Python."""
     assert scape(folder / "bodies", folder / "somebody.json", folder / "people", "-m", folder / "model.npz", "-o",
@@ -87,6 +88,7 @@ def test_every_body_is_on_the_page(monkeypatch):
 TAPES = ("stature", "chest_girth", "hip_girth", "thigh_girth_left", "calf_girth_right", "foot_length_left")
 
 
+@pytest.mark.slow
 def test_a_model_with_the_ten_landmarks_of_the_readme_is_measured(folder, tmp_path, capsys):
     """Heels, crotch and all that is not among them are found; they were refused before."""
     model = small_people()
@@ -103,6 +105,7 @@ def test_a_model_with_the_ten_landmarks_of_the_readme_is_measured(folder, tmp_pa
         assert float(ten[name]) == pytest.approx(float(full[name]), abs=0.012), name
 
 
+@pytest.mark.slow
 def test_a_set_made_without_landmarks_is_measured(tmp_path):
     """Its landmark file is empty: all are looked for, and on the built-in people they are known."""
     person = SyntheticPerson().mesh

@@ -124,6 +124,7 @@ def test_another_model_or_setting_makes_results_outdated(place):
         one.close()
 
 
+@pytest.mark.slow
 def test_a_folder_is_mended_in_the_browser_and_the_command_keeps_it(place, new_page):
     """The exchanged landmarks are taken away by key, the body, which had failed, completed again, and saved."""
     untouched = (place / "out" / "a" / "completed.ply").stat().st_mtime_ns

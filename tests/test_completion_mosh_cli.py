@@ -158,6 +158,7 @@ def test_pages_lead_to_each_other_and_tell_the_markers(done):
     assert [moving.layer("held-out markers")["labels"][i] for i in np.flatnonzero(seen)] == ["M7", "M9"]
 
 
+@pytest.mark.slow
 def test_a_folder_of_people_goes_on_where_it_was(place, tmp_path, capsys):
     people, out = tmp_path / "people", tmp_path / "out"
     shutil.copytree(place / "people", people)

@@ -169,6 +169,7 @@ def test_a_result_that_was_moved_or_made_earlier_is_told(place, tmp_path):
         MoshApp(tmp_path / "out")
 
 
+@pytest.mark.slow
 def test_a_result_is_mended_in_the_browser_and_run_again(place, new_page):
     """Two labels are exchanged by the mouse, a marker moved; the button runs again, and all markers are believed."""
     app = MoshApp(place / "out")

@@ -316,6 +316,7 @@ def test_a_marker_that_is_never_believed_is_left_out_of_the_mean():
     assert "M03" in find_distrusted_markers([motion])[0]
 
 
+@pytest.mark.slow
 def test_left_and_right_exchanged_on_many_markers_are_put_right_together():
     sides = [(f"L{name}", f"R{name}") for name in "ABCDE"]
     names = tuple(dict.fromkeys([left for left, _ in sides] + list(LABELS[5:20]) + [right for _, right in sides]

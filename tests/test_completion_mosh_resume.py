@@ -105,6 +105,7 @@ def check(copied, anew, words=(), settings=MappingProxyType({})):
         assert contents(copied / "whole") == contents(copied / "fresh")
 
 
+@pytest.mark.slow
 def test_two_workers_write_what_one_does(place, tmp_path):
     for count in ("1", "2"):
         assert run(place, place / "people", "-o", tmp_path / count, "--workers", count, soft_tissue=False) == 0

@@ -369,6 +369,7 @@ def test_a_stream_does_not_begin_with_a_frame_that_no_body_makes(passing):
     assert errors(subject, frames[3:], truth[3:20]).max() < 0.01
 
 
+@pytest.mark.slow
 def test_a_body_far_from_every_frame_is_followed_in_the_end_and_trusts_none(passing):
     subject, layout, _, positions = passing
     frames = pushed(MarkerStream(subject, layout, layout.labels, 60.0, CONFIG), 1.5 * positions[:22])

@@ -122,6 +122,7 @@ def test_frames_are_taken_one_by_one(model, known):
     assert done == [(i, i, i) for i in range(1, 5)]
 
 
+@pytest.mark.slow
 def test_a_tracker_that_goes_on_from_what_another_knew_ends_the_same(model, tmp_path):
     """Before the shape is known, right after, and between frames that are searched from scratch."""
     bodies = bodies_of(model, BETAS)

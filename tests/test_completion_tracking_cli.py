@@ -131,6 +131,7 @@ def test_the_command_writes_all_it_promises(recording, output):
     assert len(read_mesh(surfaces[0], "m").faces) == len(model.template.faces)
 
 
+@pytest.mark.slow
 def test_killed_in_the_first_frames_and_started_again(recording, tmp_path, capfd, monkeypatch):
     """The shape is found from frames of two chunks; the run is killed after the first."""
     monkeypatch.setattr(report, "track_page", quick_page)

@@ -170,6 +170,7 @@ def test_bodies_stand_whatever_axis_is_up(model, axis, sign):
     assert np.allclose(camera.vertical, up)
 
 
+@pytest.mark.slow
 def test_a_notebook_shows_what_turns_without_a_network(model, new_page, tmp_path):
     subject, motion = model.subject(np.array([0.5, -1.0])), a_motion(20)
     shown = view(model.template, model.template.vertices, model, subject, (motion, subject))

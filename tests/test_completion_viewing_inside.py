@@ -194,6 +194,7 @@ def test_a_set_is_mended_from_the_view(place):  # noqa: F811
 # in the browser
 
 
+@pytest.mark.slow
 def test_from_an_empty_page_to_a_saved_body_and_back_by_mouse(app, files, body, new_page, tmp_path):
     *_, seen = half_view(body, TOWARD, noise=0.001)
     with Server(Pages(app), say=lambda line: None) as server:
@@ -243,6 +244,7 @@ def test_from_an_empty_page_to_a_saved_body_and_back_by_mouse(app, files, body, 
     assert not app.dropped.folder.exists()
 
 
+@pytest.mark.slow
 def test_an_empty_page_fits_a_telephone_and_is_used_by_keyboard(app, files, new_page):
     with Server(Pages(app), say=lambda line: None) as server:
         page = new_page(viewport={"width": 420, "height": 800})

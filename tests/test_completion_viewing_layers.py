@@ -166,6 +166,7 @@ def test_a_statue_is_dragged_by_its_surface(place):
     assert np.linalg.norm(told(app, 0)[vertex] - wanted) < 0.03 < np.linalg.norm(before - wanted)
 
 
+@pytest.mark.slow
 def test_a_page_shows_both(place, new_page):
     app = ViewApp(Files((place.folder / "statue", place.folder / "walk"), place.folder / "worm.npz").entries())
     page = new_page(viewport={"width": 1300, "height": 800})

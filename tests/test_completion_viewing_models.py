@@ -138,6 +138,7 @@ def test_random_bodies_and_poses_are_as_the_model_says(files, model):
     assert not any(turn.any() for turn in app.controls.turns.values()) and not app.controls.betas.any()
 
 
+@pytest.mark.slow
 def test_sliders_move_the_body_to_what_the_model_says(files, page, model):
     app = app_of(files, "worm.npz")
     with Server(app, say=lambda line: None) as server:
@@ -229,6 +230,7 @@ def test_the_page_fits_a_telephone(files, new_page):
         assert bodies < panel
 
 
+@pytest.mark.slow
 def test_laid_over_each_other_each_can_be_hidden(files, page):
     app = app_of(files, "body.ply", "worm.npz", over=True)
     with Server(app, say=lambda line: None) as server:

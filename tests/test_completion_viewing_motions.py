@@ -49,6 +49,7 @@ def test_a_motion_wants_its_model(files, tmp_path):
         app_of(files, "wave.npz", model=tmp_path / "small.npz")
 
 
+@pytest.mark.slow
 def test_a_recording_laid_over_its_motion_tells_residuals(files, tmp_path, model, page):
     motion = a_motion(12, ("A", "B", "C"))
     motion.save(tmp_path / "walk.npz")

@@ -88,6 +88,7 @@ def test_markers_are_clicked_beside_the_landmarks_and_saved_as_a_layout(worn, tm
     app.close()
 
 
+@pytest.mark.slow
 def test_the_page_tells_markers_from_landmarks(worn, new_page, tmp_path):
     app = app_of(worn, tmp_path)
     with workspace(tmp_path / "out"), Server(app, say=lambda line: None) as server:

@@ -360,6 +360,7 @@ with workspace(sys.argv[1]) as space:
 """
 
 
+@pytest.mark.slow
 def test_scans_go_on_after_a_kill(tmp_path):
     ended = subprocess.run([sys.executable, "-c", KILLED, str(tmp_path / "a")], cwd=Path(__file__).parents[1],
                            capture_output=True, check=False)

@@ -65,6 +65,7 @@ def test_new_poses_and_new_animals_are_met(herd, model):
     assert max(own) < 0.01 * size and max(new) < 0.01 * size
 
 
+@pytest.mark.slow
 def test_the_coordinate_system_does_not_matter(herd, skeleton, model):
     """Upside down and elsewhere, the same model comes out."""
     from scanprep.geometry import rotations

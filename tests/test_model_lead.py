@@ -50,6 +50,7 @@ def test_a_registration_begins_at_vertices(body, scan):
             register(body, scan, start=start)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("far", [0.0, 4e6])
 def test_what_leaves_less_to_doubt_is_kept(body, scan, far):
     """Of two bodies that were found one lies beside the scan; wherever the scan is."""
@@ -138,11 +139,13 @@ def test_a_template_in_known_triangles_is_not_searched(monkeypatch):
     np.testing.assert_array_equal(parts.skeleton.part_of_face, person.average_person().part_of_face)
 
 
+@pytest.mark.slow
 def test_a_crab_is_no_person(body):
     with pytest.raises(ValueError, match="--through people: the model does not come to lie on the template"):
         model_lead(body, "people")
 
 
+@pytest.mark.slow
 def test_a_person_is_found_in_any_pose_and_lands_on_the_scan(tmp_path):
     """A template of other triangles than the model's; the scan lies on its side, and nobody says which way is up."""
     somebody = SyntheticPerson(BodyShape.like("female", weight=0.8))

@@ -118,6 +118,7 @@ def test_a_mix_wants_a_set_and_a_skeleton(folder, tmp_path):
         learned(folder / "poses", tmp_path / "m.npz", kind="mixed")
 
 
+@pytest.mark.slow
 def test_parts_are_found_where_none_are_given(folder, tmp_path):
     """Those that the search alone finds in the same poses."""
     outcome = learned(folder / "poses", tmp_path / "m.npz", scape=QUICK)
@@ -127,6 +128,7 @@ def test_parts_are_found_where_none_are_given(folder, tmp_path):
     assert json.loads(json.dumps(load_model(tmp_path / "m.npz").info))["shapes"] == 0
 
 
+@pytest.mark.slow
 def test_more_parts_are_kept_while_left_out_poses_gain(truth, monkeypatch):
     """A worm that bends everywhere wants more parts than the fewest; what was tried tells why."""
     rng = np.random.default_rng(5)

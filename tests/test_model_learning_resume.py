@@ -130,6 +130,7 @@ def test_killed_and_started_again_it_goes_on_and_ends_with_the_same_bytes(bodies
     assert not list(bodies.glob(".b.npz.scapekit/making/*")) and not list(bodies.glob(".*.part*"))
 
 
+@pytest.mark.slow
 def test_killed_twice_in_the_poses(bodies, monkeypatch):
     undisturbed = learned(bodies, "a.npz", refinements=3)
     killed(scape, "_refine", 1, words(bodies, "b.npz", refinements=3))       # after the first refinement
@@ -141,6 +142,7 @@ def test_killed_twice_in_the_poses(bodies, monkeypatch):
     assert len(calls) == 1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind, module, name, after", [
     ("skinning", skinning, "_with_joints", 2), ("skinning", skinning, "_unpose_person", 3),
     ("blendscape", scape, "shape_gradients", 2)])
@@ -151,6 +153,7 @@ def test_every_kind_goes_on(bodies, kind, module, name, after):
     assert learned(bodies, "b.npz", *given) == undisturbed
 
 
+@pytest.mark.slow
 def test_the_search_for_a_skeleton_goes_on(tmp_path, monkeypatch):
     truth = worm_model(rings=17)
     bodies = truth.subject().vertices(random_poses(truth, 5, np.random.default_rng(0), 0.4))
@@ -258,6 +261,7 @@ def test_a_second_run_on_one_output_leaves(bodies, capsys):
     learned(bodies, "m.npz")
 
 
+@pytest.mark.slow
 def test_a_mix_goes_on(tmp_path):
     from scanprep import RegisteredSet
     truth, rng = worm_model(), np.random.default_rng(0)

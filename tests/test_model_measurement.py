@@ -269,6 +269,7 @@ def test_bodies_of_other_triangles_are_refused(tapes):
             measure(wrong, tapes)
 
 
+@pytest.mark.slow
 def test_stated_errors(person, tapes):
     """None of the vertices leaves the sliding; small ones add up as squares; what moves as a whole cancels."""
     error = np.full(len(person.mesh.vertices), 0.001)

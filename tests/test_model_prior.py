@@ -166,6 +166,7 @@ def test_people_told_to_be_one_are_doubted(known, other):
     assert any("two people" in reason for reason in judge_model(model).reasons)
 
 
+@pytest.mark.slow
 def test_a_model_file_is_the_prior_of_a_command(known, tmp_path, capsys):
     known.save(tmp_path / "known.npz")
     write_mesh(tmp_path / "poses" / "one.ply", known.template)
@@ -205,6 +206,7 @@ def test_a_model_of_something_else_is_refused_by_name_and_left_out_by_itself(kno
     assert "without the built-in people" not in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_one_scan_of_a_person_gives_a_model_that_moves(tmp_path):
     """Without a flag, of a template that is a person; its triangles are not those of the built-in people."""
     write_mesh(tmp_path / "poses" / "one.ply", decimate(average_person().mesh, 4000))

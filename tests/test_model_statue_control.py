@@ -245,6 +245,7 @@ def test_an_animal_gets_a_chart():
     assert densities(animal.mesh, chart).min() > 1 / 3
 
 
+@pytest.mark.slow
 def test_seams_go_on_to_what_the_skeleton_does_not_know():
     """All of the animal one part: its legs and head are found because they come out small."""
     mesh = Animal().mesh

@@ -281,6 +281,7 @@ def test_a_person_is_found_upside_down_in_millimetres_with_holes_and_without_an_
     assert found.fit.joint_rms < 25
 
 
+@pytest.mark.slow
 def test_half_a_person_is_found_at_that_end(control):
     person = SyntheticPerson()
     centres = person.mesh.vertices[person.mesh.faces].mean(axis=1)
@@ -291,6 +292,7 @@ def test_half_a_person_is_found_at_that_end(control):
         assert np.linalg.norm(found.joints[name] - joints[part]) < 0.05, name
 
 
+@pytest.mark.slow
 def test_a_ball_is_no_person(control):
     t, z = np.meshgrid(np.linspace(0, 2 * np.pi, 40, endpoint=False), np.linspace(-0.98, 0.98, 30))
     r = np.sqrt(1 - z**2)

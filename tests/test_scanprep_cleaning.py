@@ -122,6 +122,7 @@ def test_a_body_without_a_floor_keeps_everything(person):
     assert [row.reason for row in clean.components] == [LARGEST]
 
 
+@pytest.mark.slow
 def test_floor_and_wall_go_and_the_floor_is_the_one_stood_on(scene):
     mesh, whose = scene
     rng = np.random.default_rng(2)

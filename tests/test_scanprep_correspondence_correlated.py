@@ -70,6 +70,7 @@ def apart(found, truth: Mesh) -> np.ndarray:
     return np.linalg.norm(truth.vertices[found.template_vertices] - found.scan_points, axis=1)
 
 
+@pytest.mark.slow
 def test_five_seeds_on_overlapping_sheets_become_many_pairs(found, kicking):
     assert len(found) == 80
     error = apart(found, kicking)

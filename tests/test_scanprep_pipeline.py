@@ -334,6 +334,7 @@ def test_template_that_cannot_serve(scans, template, tmp_path):
     assert not (tmp_path / "set").exists()
 
 
+@pytest.mark.slow
 def test_relative_paths_from_another_folder(scans, template, tmp_path, monkeypatch):
     """Processes are kept from one call to the next, and were started elsewhere."""
     monkeypatch.chdir(tmp_path)

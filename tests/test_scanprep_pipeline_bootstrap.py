@@ -1,4 +1,5 @@
 """A set teaches itself: doubted scans are registered through a model of the scans that are not doubted."""
+import shutil
 from dataclasses import replace
 
 import numpy as np
@@ -46,6 +47,10 @@ def body(at_rest, scale):
 
 @pytest.fixture
 def skeleton(at_rest, scale):
+    return three_parts(at_rest, scale)
+
+
+def three_parts(at_rest, scale=1.0):
     """A trunk and two arms."""
     across = at_rest.corners.mean(axis=1)[:, 0]
     part, joints = np.select([across < -0.2, across > 0.2], [1, 2], 0), np.array([[0, 0, 0], [-0.2, 0, 0], [0.2, 0, 0]])
@@ -55,18 +60,26 @@ def skeleton(at_rest, scale):
 
 @pytest.fixture
 def truth(at_rest, scale, tmp_path):
+    return write_scans(tmp_path, at_rest, scale)
+
+
+def write_scans(folder, at_rest, scale=1.0):
     """The crab in eight poses, each written as a scan of its own."""
     rng, bodies = np.random.default_rng(3), {}
     for k in range(8):
         arms = rng.normal(0, 0.5, (2, 3)) if f"scan{k}" not in BAD else rng.normal(0, 0.1, (2, 3)) + FAR_ARMS
         vertices = scale * (bent(at_rest, *arms) + rng.normal(size=3))
         bodies[f"scan{k}"] = vertices
-        write_mesh(tmp_path / "scans" / f"scan{k}.ply", at_rest.with_vertices(vertices))
+        write_mesh(folder / "scans" / f"scan{k}.ply", at_rest.with_vertices(vertices))
     return bodies
 
 
 @pytest.fixture
 def calls(truth, skeleton, monkeypatch):
+    return lose_bad_scans(monkeypatch, truth, skeleton)
+
+
+def lose_bad_scans(patch, truth, skeleton):
     """Scans that were registered, each with what led it; without a model those of `BAD` are lost."""
     made = []
 
@@ -80,10 +93,28 @@ def calls(truth, skeleton, monkeypatch):
         start = truth[name] if name not in BAD else template.vertices + truth[name].mean(axis=0)
         return LedRegistration(register(template, scan, config=QUICK, start=start), "a start")
 
-    monkeypatch.setattr(one_scan, "register_by_any", first_then_model)
+    patch.setattr(one_scan, "register_by_any", first_then_model)
     for module in (bootstrap, preparing):                      # half a minute of search for three parts
-        monkeypatch.setattr(module, "find_skeleton", lambda template, *args, **named: skeleton)
+        patch.setattr(module, "find_skeleton", lambda template, *args, **named: skeleton)
     return made
+
+
+@pytest.fixture(scope="module")
+def usual(at_rest, tmp_path_factory):
+    """A crab of the usual size: the folder of its set, and what the first run came to."""
+    folder = tmp_path_factory.mktemp("usual")
+    with pytest.MonkeyPatch.context() as patch:
+        lose_bad_scans(patch, write_scans(folder, at_rest), three_parts(at_rest))
+        return folder / "set", run(folder, at_rest)
+
+
+@pytest.fixture
+def done(usual, scale, body, calls, tmp_path):
+    """What a first run came to, and its set, which is a copy of the usual one."""
+    if scale != 1.0:
+        return run(tmp_path, body)
+    shutil.copytree(usual[0], tmp_path / "set")
+    return usual[1]
 
 
 def run(tmp_path, body, subject="crab", config=CONFIG):
@@ -96,10 +127,10 @@ def apart_mm(tmp_path, truth):
             for e in entries}
 
 
-@pytest.mark.parametrize("scale", [1.0, 0.2])
-def test_doubted_and_failed_scans_are_registered_through_what_the_others_teach(tmp_path, body, truth, calls, scale):
+@pytest.mark.parametrize("scale", [1.0, pytest.param(0.2, marks=pytest.mark.slow)])
+def test_doubted_and_failed_scans_are_registered_through_what_the_others_teach(tmp_path, body, truth, calls, done,
+                                                                               scale):
     """Of whatever size: a crab of two metres, or of a hand and a half."""
-    done = run(tmp_path, body)
     assert not done.failures and done.fresh == 8
     apart = apart_mm(tmp_path, truth)
     assert set(apart) == set(truth) and max(apart.values()) < 40 * scale
@@ -115,8 +146,8 @@ def test_doubted_and_failed_scans_are_registered_through_what_the_others_teach(t
     assert calls[made:] == [(name, None) for name in BAD]
 
 
+@pytest.mark.usefixtures("done")
 def test_scans_that_become_good_by_themselves_leave_nothing_behind(tmp_path, body, truth, calls):
-    run(tmp_path, body)
     for number, name in enumerate(reversed(BAD)):
         assert (tmp_path / "set" / "again1" / MODEL).is_file()
         # another scan in its place, which the first registration finds, as it is of another name in `truth`
@@ -131,8 +162,8 @@ def test_scans_that_become_good_by_themselves_leave_nothing_behind(tmp_path, bod
     assert not (tmp_path / "set" / "again1").exists(), "the model goes with the last of them"
 
 
+@pytest.mark.usefixtures("done")
 def test_scans_of_other_calls_keep_what_later_rounds_found(tmp_path, body, truth, calls):
-    run(tmp_path, body)
     truth["other"] = truth["scan0"] + [5.0, 0, 0]
     write_mesh(tmp_path / "more" / "other.ply", body.with_vertices(truth["other"]))
     prepare(find_scans(tmp_path / "more", "none", "crab"), body, {}, tmp_path / "set", CONFIG)
@@ -158,7 +189,7 @@ def test_scans_that_no_model_finds_keep_their_reasons_and_the_others_their_place
     assert len(RegisteredSet.load(tmp_path / "set").entries) == 6
 
 
-@pytest.mark.parametrize(("subject", "through"), [("", "auto"), ("crab", "none")])
+@pytest.mark.parametrize(("subject", "through"), [("", "auto"), pytest.param("crab", "none", marks=pytest.mark.slow)])
 def test_nothing_is_learned_from_one_pose_of_each_or_where_no_model_is_wanted(tmp_path, body, truth, calls, subject,
                                                                               through):
     done = run(tmp_path, body, subject, replace(CONFIG, scan=replace(CONFIG.scan, through=through)))

@@ -31,6 +31,7 @@ def six(tmp_path_factory, template):
     return scans, place / "one" / "set"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("sign", [signal.SIGKILL, signal.SIGINT])
 def test_killed_in_the_middle_and_started_again(six, template, tmp_path, sign):
     scans, whole = six
@@ -65,6 +66,7 @@ def test_processes_change_nothing(six, template, tmp_path):
     assert contents(tmp_path / "set") == contents(whole)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("processes, seen", [(True, True), (False, False)])
 def test_a_cluster_changes_nothing(six, template, tmp_path, processes, seen, monkeypatch):
     """Nor one whose workers do not see the files, which then travel along."""
@@ -150,6 +152,7 @@ class Deadly:
         return given
 
 
+@pytest.mark.slow
 def test_a_process_that_dies_stops_no_other_job(tmp_path):
     jobs = [Job(f"body{k}", k, tmp_path / str(k)) for k in range(3)]
     outcomes = {job.given: outcome for job, outcome in run_jobs(Deadly(), jobs, Workers(2))}

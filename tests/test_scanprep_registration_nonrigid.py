@@ -76,6 +76,7 @@ def test_a_mesh_gives_the_same_as_its_points(truth):
     assert (np.einsum("nd,nd->n", mesh.normals, cloud.normals) > 0.7).mean() > 0.97
 
 
+@pytest.mark.slow
 def test_moves_and_scales_with_the_input(truth):
     config = replace(small(), final_fit=None)
     scan = scan_of(truth, np.random.default_rng(1), 2500)

@@ -175,6 +175,7 @@ def test_fewer_doubts_are_not_bought(person, parts):
     assert not better(person.mesh, parts, replace(right, mesh=stretched), wrong)
 
 
+@pytest.mark.slow
 def test_the_search_for_parts_tells_how_far_it_is(person, monkeypatch):
     """Once: what was found is remembered."""
     template = Mesh(person.mesh.vertices + 1, person.mesh.faces[::-1])         # in triangles of its own

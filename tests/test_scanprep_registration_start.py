@@ -231,6 +231,7 @@ def test_a_surface_that_faces_away_is_no_data():
     assert evidence(mesh, replace(target, normals=-target.normals), 0.02, 0.05).confidence.max() == 0
 
 
+@pytest.mark.slow
 def test_clutter_beside_the_body_changes_little_and_noise_is_told():
     mesh = crab()
     x = bent(mesh, 0.3 * BEND[0], 0.3 * BEND[1])
@@ -271,6 +272,7 @@ def near_the_origin():
     return template, points, marks, hints, register(template, points, (marks, near), small(), None, hints, np.eye(4))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("away", [(3.0, -3.0, 3.0), (5e5, 5e6, 100.0)], ids=["a room", "UTM"])
 def test_a_scan_far_from_the_origin_is_registered_as_one_near_it(near_the_origin, away):
     """And is given back there: what led it and where it began come along.

@@ -85,6 +85,7 @@ def test_moves_that_the_alternation_takes_back_come_to_an_end(search, label, mon
     np.testing.assert_array_equal(move(search, label), label)
 
 
+@pytest.mark.slow
 @pytest.mark.timeout(60)
 def test_a_tree_is_reached_though_the_alternation_cuts_again(search, monkeypatch):
     label = np.unique(search.patch % 40, return_inverse=True)[1]

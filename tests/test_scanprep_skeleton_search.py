@@ -82,6 +82,7 @@ def test_a_mirrored_pose_is_that_of_the_other_side(crooked):
         assert np.linalg.norm(one @ R.T + t - other, axis=1).max() < 0.01
 
 
+@pytest.mark.slow
 def test_parts_that_moved_on_one_side_alone_are_found_on_both():
     body, rng = SyntheticPerson(), np.random.default_rng(1)
     bent = np.zeros((5, 16, 3))

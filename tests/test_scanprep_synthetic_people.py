@@ -71,6 +71,7 @@ def test_the_file_is_what_the_recipe_makes():
     assert population().source["recipe"] == recipe_digest(ROOT / "model" / "measurement" / "ansur2.json")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("sex", ["female", "male"])
 def test_people_of_a_sex_measure_as_those_of_the_survey(sex):
     """Means of measures, their spread and correlations, of 64 whose betas have exactly the moments of the sex."""

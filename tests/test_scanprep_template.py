@@ -109,6 +109,7 @@ def test_what_is_not_manifold_is_repaired_first_and_that_is_said(place, tmp_path
     assert (made.vertex_component.max() == 0) == (command[0] == "repair")               # the speck stays, unless asked
 
 
+@pytest.mark.slow
 def test_a_cloud_becomes_a_closed_template(body):
     pytest.importorskip("open3d")
     rng = np.random.default_rng(1)
@@ -137,6 +138,7 @@ def view_of(body, direction, count, rng):
     return points[facing]
 
 
+@pytest.mark.slow
 def test_views_without_cameras_find_their_places(body):
     """Turned by 2 degrees and moved by 1 cm each; where cameras stood, and which side is outside, nobody says."""
     pytest.importorskip("open3d")
@@ -173,6 +175,7 @@ def test_what_cannot_be_meshed_says_why(tmp_path, capsys, monkeypatch):
         mesh_of_cloud(np.random.default_rng(0).normal(size=(500, 3)))
 
 
+@pytest.mark.slow
 def test_noise_on_one_side_does_not_draw_the_triangles_there(body):
     """Collapses of least error left 54% of the triangles on the noisy side."""
     noise = 0.003 * np.random.default_rng(0).normal(size=(len(body.vertices), 1)) * (body.vertices[:, :1] > 0)

@@ -298,6 +298,7 @@ def test_a_click_that_meets_nothing_is_told_and_wrong_messages_are_refused(folde
             sent(app, kind, **fields)
 
 
+@pytest.mark.slow
 def test_the_others_are_predicted_from_four(person):
     """Registration of a body to itself, moved and turned: within a centimetre, mostly."""
     template = {name: person.mesh.vertices[vertex] for name, vertex in landmarks().items()}
@@ -334,6 +335,7 @@ def test_landmarks_are_picked_by_mouse_and_saved(new_page, folder, person):
     assert set(read_landmarks(folder / "anna.landmarks.json")) == set(FOUR)
 
 
+@pytest.mark.slow
 def test_the_page_helps_a_hand(new_page, folder, person):
     """Views, clicks just beside the body, landmarks behind it, and those that are not where they are predicted."""
     app = app_of(folder)
@@ -382,6 +384,7 @@ def test_the_page_helps_a_hand(new_page, folder, person):
         assert page.errors == []
 
 
+@pytest.mark.slow
 def test_a_landmark_is_dragged(new_page, folder, person):
     app, end = app_of(folder), time.monotonic() + 20
     app._predict_if_time = lambda send, pane: None
@@ -558,6 +561,7 @@ def test_the_list_of_names_is_one_stop_of_the_tab_key(new_page, folder, person):
         assert page.errors == []
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("width", [1400, 420])
 def test_the_instruction_stands_above_the_bodies(folder, person, new_page, width):
     """Also on a telephone, where it was below the fold; and the question about a far click with its buttons."""
