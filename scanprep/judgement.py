@@ -26,7 +26,14 @@ BUILD, ANY_BUILD = (13.0, 55.0), (9.0, 90.0)
 # is this times the first. `mosh` with a model of other people finds up to 12 for 18 betas where the motion is right
 # but the body is not; recordings scaled by 1.6 and 2.54 end at 20 and 46.
 ONE_OF, USUAL, TOO_LONG = 10_000, 1.6, 1.8
+# Metres: a toddler of one year, and taller than almost anybody. Children below an adult's size need a look.
+ANYBODY = (0.65, 2.30)
+WRONG_UNIT = "the wrong unit or scale? (--unit, or --unit unknown)"
 NAMED = 3                   # results that a judgement about many names: more would not be read
+
+
+class WrongScaleError(ValueError):
+    """A scan shows a person of a size that nobody has: its unit is another one."""
 
 
 @dataclass(frozen=True)
@@ -169,15 +176,14 @@ def implausible_body(stature: float, volume: float | None = None, betas: np.ndar
     >>> implausible_body(1.75, 74.0, np.ones(10)).verdict
     'good'
     >>> implausible_body(2.61, 290.0).reasons[0]
-    'the person is 2.61 m tall: the wrong unit or scale? (--unit)'
+    'the person is 2.61 m tall: the wrong unit or scale? (--unit, or --unit unknown)'
     """
     failed, check = [], []
-    anybody = (1.00, 2.30)  # metres: a child of about four, and taller than almost anybody
-    if not anybody[0] <= stature <= anybody[1]:
-        failed.append(f"the person is {stature:.2f} m tall: {cause or 'the wrong unit or scale? (--unit)'}")
+    if not ANYBODY[0] <= stature <= ANYBODY[1]:
+        failed.append(f"the person is {stature:.2f} m tall: {cause or WRONG_UNIT}")
     elif not ADULTS[0] <= stature <= ADULTS[1]:
         who = "a child" if stature < ADULTS[0] else "a giant"
-        check.append(f"the person is {stature:.2f} m tall: {cause or who + ', or the wrong scale?'}")
+        check.append(f"the person is {stature:.2f} m tall: {cause or f'{who}, or {WRONG_UNIT}'}")
     if volume is not None and not failed:
         # build: volume relative to stature, as the body-mass index
         build = volume / stature**2

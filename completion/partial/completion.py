@@ -12,8 +12,9 @@ from model.body import BodyModel
 from model.fitting.bodies import as_body
 from model.fitting.free_space import free_space_violation
 from model.fitting.free_surface import distance_to, free_surface
-from model.fitting.limbs import with_limbs
+from model.fitting.limbs import with_limbs, with_standing
 from model.fitting.rounds import solve_jointly
+from model.fitting.scale import ScaledBody, check_size
 from model.fitting.scan import Scan
 from model.fitting.scan_fit import STRANGE, ScanFit, scan_fit
 from model.fitting.starts import best_starts, first_starts, going_on
@@ -32,7 +33,6 @@ from scanprep.threads import one_thread
 from .alternation import turns_of
 from .confidence import distance_to_seen, estimate_error, posterior_error, probability_within
 from .inputs import prepare_in_metres
-from .scale import ScaledBody
 from .settings import CompletionConfig
 
 Progress = Callable[[int, int], None]
@@ -194,7 +194,10 @@ def complete(body: BodyModel | Subject, scan: Scan, landmarks: tuple[np.ndarray,
     sparse = fit.few()
     starts = going_on(fit, start.pose, start.trans, start.betas) if start else first_starts(fit, sparse)   # [SCAPE] §7
     report_progress(1, total)
-    x, rival = with_limbs(fit, sparse, best_starts(sparse, starts))
+    starts = best_starts(sparse, starts)
+    if not config.free_scale:
+        check_size(person, sparse, starts[0])
+    x, rival = with_standing(fit, sparse, *with_limbs(fit, sparse, starts))
     report_progress(2, total)
     # fit pose, shape and place to the scan
     solved = solve(fit, sparse, x, lambda done: report_progress(2 + done, total))       # [SCAPE] Eq. 10, Eq. 11

@@ -6,13 +6,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from model.fitting.bodies import FixedBody
+from model.fitting.scale import landmark_scale, rough_scale
 from model.fitting.scan import Scan, ScanPoints, all_points, check_mask, prepare_picture, prepare_scan
 from scanprep.correspondence.correspondences import check_pairs
 from scanprep.depth_camera.picture import DepthPicture
 from scanprep.geometry.mesh import Mesh
 from scanprep.judgement import size
 
-from .scale import landmark_scale, rough_scale
 from .settings import CompletionConfig
 
 

@@ -17,8 +17,9 @@ from scanprep.threads import one_thread
 from ..body import BodyModel
 from .bodies import FixedBody, as_body
 from .free_surface import free_surface
-from .limbs import with_limbs
+from .limbs import with_limbs, with_standing
 from .rounds import solve_jointly
+from .scale import check_size
 from .scan_fit import ScanFit, prepare_scan_fit
 from .settings import ScanFitConfig
 from .starts import best_starts, first_starts, from_nothing
@@ -123,13 +124,17 @@ def _search(body: FixedBody, scan: Mesh | np.ndarray, landmarks: Landmarks
     starts = first_starts(fit, few)
     if len(landmarks[0]) >= 3:                 # few landmarks determine little: also try starts without them
         starts = np.concatenate([starts, from_nothing(few)])
-    return fit, few, best_starts(few, starts), factor
+    starts = best_starts(few, starts)
+    if fit.body is body:                       # a hand or a horse is brought to the size of a person
+        check_size(body, few, starts[0])
+    return fit, few, starts, factor
 
 
 @one_thread()
 def _solve_with_limbs(fit: ScanFit, few: ScanFit, starts: np.ndarray) -> list[np.ndarray]:
     """Solve from the best start after re-initialisation of limbs, and from one that explains nearly as much."""
-    return [_solve(fit, few, x) for x in with_limbs(fit, few, starts) if x is not None]
+    bodies = with_standing(fit, few, *with_limbs(fit, few, starts))
+    return [_solve(fit, few, x) for x in bodies if x is not None]
 
 
 @one_thread()

@@ -11,6 +11,7 @@ from scanprep.skeleton.roles import LIMBS, find_numbered_roles
 from scanprep.skeleton.tree import Skeleton
 
 TILT = 0.35                          # radians: how far trunks of standing people lean, standard deviation
+AXES = np.concatenate([np.eye(3), -np.eye(3)])       # of a scan: along one of them people mostly stand
 PICTURE = np.array([[0, -1.0, 0], [0, 1.0, 0], [1.0, 0, 0], [-1.0, 0, 0]])    # a camera as it is, upside down, rolled
 SPREAD = 3000                        # rotations, 15 degrees apart, of which the upright ones are tried
 SPREAD_OF_MANY = 1500                # rotations where up is one of several directions, so that the time stays alike

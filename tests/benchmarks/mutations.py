@@ -374,7 +374,7 @@ MUTATIONS = (
         ("errors of one direction", "gammainc(1.5, 1.5 * (tolerance", "gammainc(0.5, 0.5 * (tolerance"),
         ("what the fit believes taken for true", "(1.4 * posterior)", "(1.0 * posterior)"),
         ("far from data as sure as the model's left-out poses", "left_out_share = 0.85", "left_out_share = 0.425")),
-    *of("completion/partial/scale.py", "completion_views",
+    *of("model/fitting/scale.py", "completion_views",
         ("scale turned over", "factor = float(np.exp(LOOSE * x[-1]))", "factor = float(np.exp(-LOOSE * x[-1]))"),
         ("slope of the scale", "-LOOSE * off[..., None]", "LOOSE * off[..., None]")),
     *of("completion/mocap/subject/attachment.py", "completion_mosh_terms",

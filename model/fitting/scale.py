@@ -1,4 +1,7 @@
-"""Scans of unknown unit: one scale factor is estimated together with pose, place and shape."""
+"""The size of the person in a scan: a scale factor is estimated together with pose, place and shape.
+
+For scans of unknown unit it is part of the result. For others it tells a wrong unit before the long part of a search.
+"""
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
@@ -7,19 +10,27 @@ from functools import partial
 import numpy as np
 from scipy.spatial import cKDTree
 
-from model.fitting import energy
-from model.fitting.bodies import FixedBody, Follow, NearPoints
-from model.fitting.energy import MovingPoints
-from model.fitting.named_points import anneal
-from model.fitting.scan import spread_points
-from model.fitting.starts import all_rotations
-from model.priors import gaussian_prior, typical_poses
 from scanprep.geometry import rotations
 from scanprep.geometry.least_squares import Dense, levenberg_marquardt, normal_equations
+from scanprep.judgement import ANYBODY, WRONG_UNIT, WrongScaleError
+from scanprep.skeleton.roles import find_numbered_roles
 
-from .settings import CompletionConfig
+from ..priors import gaussian_prior, typical_poses
+from . import energy
+from .bodies import FixedBody, Follow, NearPoints
+from .energy import MovingPoints
+from .named_points import anneal
+from .scan import ScanPoints, spread_points
+from .scan_fit import MIN_COSINE, ScanFit, scan_fit
+from .settings import ScanFitConfig
+from .starts import all_rotations, best_starts, from_nothing
+from .upright import standing_axis
 
 LOOSE = 0.3                          # standard deviation of the logarithm of the scale about the first guess
+# A scan whose length differs by less than this factor from the template's may be of a body in its right unit.
+SCALED = 1.3
+BADLY = 0.06                         # share of a scan without a body near: right first starts have 0.055 at most
+ADULT_HEAD = 0.13                    # of a head that is not too large for the stature, as those of children are
 POINTS = 1500                        # points from which the extent of a scan or body is taken
 
 
@@ -141,7 +152,7 @@ def _extent(points: np.ndarray, weights: np.ndarray | None = None) -> tuple[np.n
     return size, spreads / size[:, None]
 
 
-def landmark_scale(body: FixedBody, vertices: np.ndarray, points: np.ndarray, config: CompletionConfig) -> float:
+def landmark_scale(body: FixedBody, vertices: np.ndarray, points: np.ndarray, config: ScanFitConfig) -> float:
     """Estimate the factor that brings landmarks (L, 3), roughly in metres, closer to metres."""
     scaled = ScaledBody(body)
     prior = gaussian_prior(body.pose_mean, body.pose_covariance)
@@ -170,3 +181,91 @@ def landmark_scale(body: FixedBody, vertices: np.ndarray, points: np.ndarray, co
 
     minimum = anneal(lambda x, stiff: levenberg_marquardt(partial(equations, stiff=stiff), x, 8, 1e-3), x)
     return float(np.exp(LOOSE * minimum.x[np.argmin(minimum.energy), -1]))
+
+
+@dataclass(frozen=True)
+class PersonSize:
+    """The size of the person in a scan, found by fitting a body of free scale on few points.
+
+    `stature` is in the unit of the scan, `metres` the length of that unit, `lost` the share of points without a body
+    near, and `misfit` that of the search. `head` is the size of the head for that stature, 1 for an adult. Of 34
+    synthetic people adults had 0.96 to 1.07, also with hair, children below 1.15 m 1.20 to 1.32.
+    """
+
+    stature: float
+    metres: float
+    lost: float
+    misfit: float
+    head: float
+
+
+def find_size(body: FixedBody, cloud: ScanPoints, config: ScanFitConfig) -> PersonSize:
+    """Find the size of the person in a scan of any unit, with typical poses in all orientations; it takes 2 s.
+
+    On 28 scans of synthetic people from 0.85 to 1.82 m the stature was 3% off at most, and on one of 1.35 m 4%.
+    """
+    rough = rough_scale(body, cloud.points)
+    few = scan_fit(ScaledBody(body), cloud.scale_by(rough), np.zeros(0, dtype=np.int64), np.zeros((0, 3)), config).few()
+    x = best_starts(few, from_nothing(few))[0]
+    own, factor = few.body.in_metres(x)
+    shape = own.copy()
+    shape[:body.n_angles + 3] = 0
+    height = float(np.ptp(body.vertices(shape), axis=0).max())
+    return PersonSize(height / (rough * factor), rough * factor, float(few.find_unexplained(x, few.thin).mean()),
+                      few.misfit(x), _relative_head(few, x, body, shape))
+
+
+def check_size(body: FixedBody, few: ScanFit, x: np.ndarray) -> None:
+    """Raise WrongScaleError for a scan of a person of another size than its unit says; `x` (P,) is the best start.
+
+    Asked where the best start explains the scan badly, and the scan is not as long as a body: another size must then
+    explain it far better. A child may be small, with a head that is large for it; an adult of the size of a child has
+    the wrong unit.
+    """
+    off, axis = few.cloud.points - few.cloud.points.mean(axis=0), standing_axis(body.template, body.skeleton)
+    if axis is None or few.cloud.person is not None:                   # no person, or a picture, which is in metres
+        return
+    lost, misfit = float(few.find_unexplained(x, few.thin).mean()), few.misfit(x)
+    length = np.ptp(off @ np.linalg.svd(off[::1 + len(off) // 5000], full_matrices=False)[2][0])
+    if lost < BADLY or 1 / SCALED < length / np.ptp(body.template.vertices @ axis) < SCALED:
+        return
+    person = find_size(body, few.cloud, few.config)
+    # a third: what is explained as badly at every size, like a room or a part of a body, says nothing about its size
+    if person.lost > lost / 3 or person.misfit > misfit / 3 or 1 / SCALED < person.metres < SCALED:
+        return
+    if not ANYBODY[0] <= person.stature <= ANYBODY[1]:
+        raise WrongScaleError(f"the person is {person.stature:.2f} m tall: {WRONG_UNIT}")
+    if abs(person.head - 1) < ADULT_HEAD:
+        raise WrongScaleError(f"the person is {person.stature:.2f} m tall, with the proportions of an adult: "
+                              f"{WRONG_UNIT}")
+
+
+def _relative_head(few: ScanFit, x: np.ndarray, body: FixedBody, shape: np.ndarray) -> float:
+    """Compute how large the head is for the stature, relative to the mean person; `shape` (P,) is the body at rest."""
+    parts = [p for role, p in find_numbered_roles(body.skeleton.names, body.skeleton.joints).items()
+             if role == "skullbase"]
+    skin, head = few.skin(x), np.isin(few.part, parts)
+    if not head.any():
+        return np.nan
+    # lay the fitted head on the scan, with a scale of its own: points to planes, robustly
+    places, normals, scale = skin.places[head], skin.normals[head], 1.0
+    for _ in range(15):
+        near = few.data.tree.match(places, normals, 0.12, MIN_COSINE)
+        if near.valid.sum() < 30:
+            return np.nan
+        y, n, p, centre = *(a[near.index[near.valid]] for a in (few.cloud.points, few.cloud.normals)), \
+            places[near.valid], places.mean(axis=0)
+        J = np.hstack([np.cross(p - centre, n), n, ((p - centre) * n).sum(axis=1, keepdims=True)])
+        off = ((y - p) * n).sum(axis=1)
+        w = energy.geman_mcclure(off, 0.02)
+        step = np.linalg.solve((J * w[:, None]).T @ J + 1e-6 * np.eye(7), (J * w[:, None]).T @ off)
+        R, grown = rotations.exp(step[:3]), 1 + float(step[6])
+        places, normals = centre + grown * (places - centre) @ R.T + step[3:6], normals @ R.T
+        scale *= grown
+    # the fitted body already has a head of its own
+    own = np.isin(body.skeleton.part_of_vertex(body.template), parts)
+    shares = []
+    for unknowns in (shape, np.zeros_like(shape)):
+        y = body.vertices(unknowns)
+        shares.append(np.linalg.norm(y[own] - y[own].mean(axis=0)) / np.ptp(y, axis=0).max())
+    return scale * float(shares[0] / shares[1])
