@@ -17,6 +17,7 @@ if TYPE_CHECKING:               # heavy imports are inside functions: --help mus
     from .geometry.mesh import Mesh
 
 Unit = Literal["m", "mm", "cm", "in"]
+PersonUnit = Literal["m", "mm", "cm", "in", "unknown"]
 ScanArg = Annotated[Path, Place("SCAN")]
 MeshArg = Annotated[Path, Place("MESH")]
 SetArg = Annotated[Path, Place("SET")]

@@ -228,11 +228,24 @@ def extent(points: np.ndarray) -> float:
     return float(np.linalg.norm(np.ptp(finite, axis=0))) if len(finite) else np.nan
 
 
-def unit_problem(found: float, expected: float, what: str, least: float = 0.2) -> str | None:
+def check_unit(scan: Mesh | np.ndarray, body: np.ndarray, what: str) -> None:
+    """Raise WrongScaleError for a scan that cannot show a body (N, 3), metres, before minutes of work on it.
+
+    A hand has a tenth of a body's size, and a room around it five times that size. `what` is the subject of the
+    sentence.
+    """
+    points = scan.vertices if isinstance(scan, Mesh) else scan
+    if problem := unit_problem(extent(points), extent(body), what, 1 / 30, 10):
+        raise WrongScaleError(problem)
+
+
+def unit_problem(found: float, expected: float, what: str, least: float = 0.2, most: float = 2.5) -> str | None:
     """Return why data `found` metres large, for a body of `expected` metres, are in another unit; None if they are not.
 
-    `what` is the subject of the sentence; `least` is the smallest share of a body that the data may cover.
+    `what` is the subject of the sentence; `least` and `most` are the smallest and the largest share of a body's extent
+    that the data may have.
     """
-    if not np.isfinite(found) or least <= found / expected <= 2.5:
+    if not np.isfinite(found) or least <= found / expected <= most:
         return None
-    return f"{what} {found / expected:.3g} times as large as the body: the wrong unit? (--unit)"
+    return (f"{what} {found:.3g} m from corner to corner, {found / expected:.3g} times as large as the body: the wrong "
+            "unit? (--unit)")

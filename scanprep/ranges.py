@@ -7,7 +7,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 from collections.abc import Iterator
-from typing import Annotated, Any, get_args, get_type_hints
+from typing import Annotated, Any, Literal, get_args, get_type_hints
 
 import numpy as np
 
@@ -58,6 +58,20 @@ Beta = Annotated[float, BETAS]
 Count = Annotated[int, Range(1, 10_000_000)]
 Faces = Annotated[int, Range(4, 100_000_000)]
 Seed = Annotated[int, Range(0, 2**32 - 1)]
+Axis = Literal["x", "-x", "y", "-y", "z", "-z"]     # a direction along an axis of a scan
+
+
+def direction_of(axis: Axis) -> tuple[float, float, float]:
+    """Return the unit vector of a direction along an axis.
+
+    Examples
+    --------
+    >>> direction_of("-y")
+    (0.0, -1.0, 0.0)
+    """
+    sign, at = (-1.0 if axis.startswith("-") else 1.0), "xyz".index(axis[-1])
+    x, y, z = (sign if i == at else 0.0 for i in range(3))
+    return x, y, z
 Processes = Annotated[int | str, Range(0, 1000)]    # number of processes, or the address of a scheduler
 
 

@@ -7,9 +7,9 @@ from completion_bodies import MARKS, POSE, QUICK, TRANS, half_view, worm_with_pr
 from derivatives import differences
 
 from completion.partial.completion import complete
-from model.fitting.scale import LOOSE, ScaledBody, landmark_scale, rough_scale
 from model.fitting.bodies import as_body
 from model.fitting.free_space import find_cameras, free_space_violation
+from model.fitting.scale import LOOSE, ScaledBody, landmark_scale, rough_scale
 from model.fitting.scan import as_views, prepare_scan
 from scanprep.geometry.files import PointCloud
 from scanprep.geometry.mesh import Mesh

@@ -4,17 +4,18 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 from shlex import quote
-from typing import Annotated, Literal
+from typing import Annotated
 
 from scanprep.arguments import Place, UsageError
 from scanprep.batch.pool import Workers
 from scanprep.batch.workspace import Task, Workspace
-from scanprep.cli import Output, Unit
+from scanprep.cli import Output, PersonUnit, Unit
 from scanprep.console import Metric, Outcome, say
 from scanprep.folders import do_one, load_results
 from scanprep.geometry.landmarks import landmarks_beside
 from scanprep.judgement import judge_many
 from scanprep.pipeline.scans import find_scans
+from scanprep.ranges import Axis, direction_of
 
 from ..cli import ModelOrNone, body_of, marks_of_template, read_model
 from .colors import ColorConfig
@@ -23,14 +24,11 @@ from .settings import CompletionConfig
 from .work import CompletionInputs, CompletionTask
 
 ScansArg = Annotated[tuple[Path, ...], Place("SCAN [SCAN ...]")]
-AXES = {"x": (1.0, 0.0, 0.0), "-x": (-1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "-y": (0.0, -1.0, 0.0),
-        "z": (0.0, 0.0, 1.0), "-z": (0.0, 0.0, -1.0)}
 
 
 def complete_scan(scans: ScansArg = (), *, output: Output, model: ModelOrNone = None, landmarks: Path | None = None,
                   subject: str | None = None, template_landmarks: Path | None = None, mask: tuple[Path, ...] = (),
-                  unit: Unit | Literal["unknown"] | None = None,
-                  up: Literal["x", "-x", "y", "-y", "z", "-z"] | None = None, interactive: bool = False,
+                  unit: PersonUnit | None = None, up: Axis | None = None, interactive: bool = False,
                   config: CompletionConfig = CompletionConfig(),
                   workers: Workers = Workers(), space: Workspace) -> Outcome:
     """The whole body from a scan of some of it.
@@ -70,7 +68,7 @@ def complete_scan(scans: ScansArg = (), *, output: Output, model: ModelOrNone = 
     if unit == "unknown":
         config, unit = replace(config, free_scale=True), None
     if up is not None:
-        config = replace(config, up=AXES[up])
+        config = replace(config, up=direction_of(up))
     # a folder: each scan by itself
     if len(scans) == 1 and scans[0].is_dir():
         if len(mask) > 1:

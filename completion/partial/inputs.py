@@ -11,7 +11,7 @@ from model.fitting.scan import Scan, ScanPoints, all_points, check_mask, prepare
 from scanprep.correspondence.correspondences import check_pairs
 from scanprep.depth_camera.picture import DepthPicture
 from scanprep.geometry.mesh import Mesh
-from scanprep.judgement import size
+from scanprep.judgement import check_unit, size
 
 from .settings import CompletionConfig
 
@@ -42,6 +42,8 @@ def prepare_in_metres(body: FixedBody, scan: Scan, landmarks: tuple[np.ndarray, 
         every = all_points(scan)
         bare = every if masked is None else every[~check_mask(masked, len(every))]
         metres = rough_scale(body, bare)
+    else:
+        check_unit(all_points(scan), body.template.vertices, "the scan is")
     # landmarks in the same unit; with enough of them the scale is refined
     vertices, points = np.zeros(0, dtype=np.int64), np.zeros((0, 3))
     if landmarks is not None:

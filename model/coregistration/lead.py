@@ -17,15 +17,21 @@ from scipy.spatial import cKDTree
 
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.surface import Surface
-from scanprep.judgement import extent, unit_problem
+from scanprep.judgement import WrongScaleError, extent, unit_problem
+from scanprep.ranges import Axis, direction_of
 from scanprep.registration.nonrigid import covers
 from scanprep.registration.person import PersonParts, average_person
 from scanprep.skeleton.tree import Skeleton
 from scanprep.synthetic.anatomy import PARENTS, PARTS
+from scanprep.threads import one_thread
 
 from ..body import BodyModel
 from ..files import BUILT_IN, load_model
+from ..fitting.bodies import as_body
+from ..fitting.scale import BADLY, find_size
+from ..fitting.scan import prepare_scan
 from ..fitting.search import Landmarks, ModelMismatchError, find_bodies, lay_model
+from ..fitting.settings import ScanFitConfig
 from ..learning.config import LearnConfig
 from ..learning.scape import learn_scape
 
@@ -52,14 +58,23 @@ class ModelLead:
         ahead = normals_at(body, self.corners, self.weights)
         return np.einsum("nk,nkd->nd", self.weights, body.vertices[self.corners]) + self.off[:, None] * ahead
 
-    def __call__(self, scan: Mesh | np.ndarray, landmarks: Landmarks | None = None, model: Path | None = None
-                 ) -> Iterator[np.ndarray]:
+    def __call__(self, scan: Mesh | np.ndarray, landmarks: Landmarks | None = None, model: Path | None = None,
+                 up: Axis | None = None) -> Iterator[np.ndarray]:
         """Yield the template's vertices (N, 3) on the bodies of `find_bodies`, each computed on demand."""
         marked = None
         if landmarks is not None:              # landmarks of the template become the nearest vertices of the model
             marked = self.corners[landmarks[0], self.weights[landmarks[0]].argmax(axis=1)], landmarks[1]
         body_model = model_at(self.name if model is None else model)
-        return map(self.carry, find_bodies(body_model, scan, marked))
+        return map(self.carry, find_bodies(body_model, scan, marked, None if up is None else direction_of(up)))
+
+    def person_size(self, scan: Mesh | np.ndarray) -> tuple[float, float]:
+        """Find the length of a scan's unit and the stature of the person in it, both in metres."""
+        with one_thread():
+            size = find_size(as_body(model_at(self.name)), prepare_scan(scan), ScanFitConfig())
+        if size.lost > BADLY:
+            raise WrongScaleError(f"scan: no person was found in it at any scale, {100 * size.lost:.0f}% of it has no "
+                                  "body near: expected the scan of a person, or its unit")
+        return size.metres, size.metres * size.stature
 
 
 def model_lead(template: Mesh, through: str, progress: Callable[[int, int], None] | None = None) -> ModelLead | None:
@@ -86,6 +101,8 @@ def model_lead(template: Mesh, through: str, progress: Callable[[int, int], None
         # the body is found on the template as on any scan, and laid on it
         try:
             laid = lay_model(model, template, progress)
+        except WrongScaleError as error:
+            raise ValueError(f"template: {error}; make it with scape prep template, in its right unit") from error
         except ModelMismatchError as error:
             if through == "auto":
                 return None

@@ -74,7 +74,8 @@ def lay_model(model: BodyModel, template: Mesh, progress: Callable[[int, int], N
                              "lies off it: a model of something else?")
 
 
-def find_bodies(model: BodyModel, scan: Mesh | np.ndarray, landmarks: Landmarks | None = None) -> Iterator[Mesh]:
+def find_bodies(model: BodyModel, scan: Mesh | np.ndarray, landmarks: Landmarks | None = None,
+                up: tuple[float, float, float] | None = None) -> Iterator[Mesh]:
     """Yield likely bodies of a model on a scan, each bent onto it where there are data, and computed on demand.
 
     First comes the best of the typical poses. Then come the best after re-initialisation of limbs, and another body
@@ -88,9 +89,16 @@ def find_bodies(model: BodyModel, scan: Mesh | np.ndarray, landmarks: Landmarks 
         The scan of a whole body.
     landmarks : (L,) int and (L, 3) float, metres, optional
         Few vertices of the model and where they are on the scan.
+    up : (3,) floats, optional
+        The direction that is up in the scan, where people in it mostly stand.
+
+    Raises
+    ------
+    WrongScaleError
+        A person of another size than the unit of the scan says.
     """
     body, size = as_body(model), float(np.sqrt(model.template.face_areas.sum()))
-    fit, coarse, starts, factor = _search(body, scan, landmarks or NO_LANDMARKS)
+    fit, coarse, starts, factor = _search(body, scan, landmarks or NO_LANDMARKS, ScanFitConfig(up=up))
 
     def mesh_of(x: np.ndarray) -> Mesh:
         """Compute the predicted body of unknowns (P,) at its own size."""
@@ -113,13 +121,13 @@ def find_bodies(model: BodyModel, scan: Mesh | np.ndarray, landmarks: Landmarks 
 
 
 @one_thread()
-def _search(body: FixedBody, scan: Mesh | np.ndarray, landmarks: Landmarks
+def _search(body: FixedBody, scan: Mesh | np.ndarray, landmarks: Landmarks, config: ScanFitConfig
             ) -> tuple[ScanFit, ScanFit, np.ndarray, float]:
     """Prepare the fit of a scan, the same with few vertices, and the unknowns (n, P) of likely bodies, best first.
 
     Also return the factor by which lengths of the fit are larger than those of the scan.
     """
-    fit, factor = prepare_scan_fit(body, scan, *landmarks, ScanFitConfig())
+    fit, factor = prepare_scan_fit(body, scan, *landmarks, config)
     few = fit.few()
     starts = first_starts(fit, few)
     if len(landmarks[0]) >= 3:                 # few landmarks determine little: also try starts without them

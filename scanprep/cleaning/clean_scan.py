@@ -2,6 +2,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -10,12 +11,12 @@ from ..geometry.mesh import Mesh
 from ..geometry.places import spacing
 from ..geometry.sanitise import sanitise
 from ..geometry.sparse import label_components
-from ..ranges import Settings
+from ..ranges import FLAG, Axis, Settings, direction_of
 from .floor import Plane, find_plane, floor_points
 
 LARGEST, LANDMARKS, NEAR = "the largest piece", "the piece with the landmarks", "near the body"
 MUTUAL, SPARSE = 6, 3.0              # neighbours linked in sparse regions, and their largest distance in links
-FAR, SPECKS, FLOOR = "apart from the body", "specks", "a plane with all on one side"
+FAR, SPECKS, FLOOR = "apart from the body", "specks", "a plane with all on one side, and what is below it"
 
 
 @dataclass(frozen=True)
@@ -35,6 +36,8 @@ class CleanScanConfig(Settings):
         A plane with less measured area is no floor; both soles together have about 0.04.
     spacings : float
         Points closer than this many median spacings are linked.
+    up : 'x', '-x', 'y', '-y', 'z' or '-z', optional
+        The axis of the scan that points up, where it is known: then only floors are taken off, and no walls.
 
     Examples
     --------
@@ -47,6 +50,7 @@ class CleanScanConfig(Settings):
     planes: int = 3
     floor_area: float = 0.1
     spacings: float = 3.0
+    up: Annotated[Axis | None, FLAG] = None
 
 
 @dataclass(frozen=True)
@@ -191,7 +195,8 @@ def _without_planes(mesh: Mesh, link: float, config: CleanScanConfig, landmarks:
     label = np.full(len(points), -1)
     while len(planes) < config.planes and (label < 0).sum() > config.min_points:
         rest = np.flatnonzero(label < 0)
-        plane = find_plane(points[rest], config.floor_area, rng)
+        plane = find_plane(points[rest], config.floor_area, rng,
+                           None if config.up is None else np.array(direction_of(config.up)))
         if plane is None:
             break
         # the body stands on the plane; its footprint is not removed

@@ -8,6 +8,8 @@ from scipy import ndimage
 from scipy.spatial import cKDTree
 
 WIDEST = 0.03              # metres: half-width of the band around a first guess
+STEEPEST = 0.9             # cosine of the angle between a floor's normal and the direction that is up, 26 degrees
+HIGHEST = 0.6              # metres: a pedestal is lower than the legs of somebody whose seat could be taken for its top
 SIGMAS = 3.5               # points within so many standard deviations are on the floor: 99.95% of Gaussian noise
 
 
@@ -39,10 +41,12 @@ class Plane:
         return Plane(-self.normal, -self.offset, self.noise)
 
 
-def find_plane(points: np.ndarray, min_area: float, rng: np.random.Generator) -> Plane | None:
+def find_plane(points: np.ndarray, min_area: float, rng: np.random.Generator, up: np.ndarray | None = None
+               ) -> Plane | None:
     """Find the largest plane with nearly all points (n, 3) on it or on one side; None below `min_area` m².
 
-    Candidates are tangent planes at random points; the best one is refined on ever closer points.
+    Behind it there may be the pedestal whose top it is. Candidates are tangent planes at random points; the best one is
+    refined on ever closer points. With the direction `up` (3,) given, only floors are found.
     """
     sample = points[rng.permutation(len(points))[:10_000]]
     tree = cKDTree(sample)
@@ -57,7 +61,9 @@ def find_plane(points: np.ndarray, min_area: float, rng: np.random.Generator) ->
         height = plane.height(sample)
         if np.mean(height < -WIDEST) > np.mean(height > WIDEST):
             plane, height = plane.flip(), -height
-        if np.mean(height < -WIDEST) > most_below:
+        if up is not None and plane.normal @ up < STEEPEST:
+            continue
+        if np.mean(height < -WIDEST) > most_below and not _is_pedestal(plane, sample):
             continue
         # measured area, in cells of 3 cm
         area = _area_of_cells(plane.flat(sample[np.abs(height) < WIDEST / 2]), WIDEST)
@@ -65,14 +71,29 @@ def find_plane(points: np.ndarray, min_area: float, rng: np.random.Generator) ->
             best, best_area = plane, area
     if best is None:
         return None
-    plane = _refine(best, points)
-    height = plane.height(points)
-    on_it = np.abs(height) <= plane.thickness
-    if (plane.noise > 2 * local_noise(points, rng)           # curved surface such as a back is no floor
-        or np.mean(height < -WIDEST / 2) > most_below
-        or _area_of_cells(plane.flat(points[on_it]), WIDEST) < min_area):
-        return None
-    return plane
+    noise = local_noise(points, rng)
+    # in the wide band soles may hide a small floor, in the narrow one the candidate may not be level enough
+    for band in WIDEST, min(WIDEST, max(4 * best.noise, 4 * noise)):
+        plane = _refine(best, points, band)
+        height = plane.height(points)
+        on_it = np.abs(height) <= plane.thickness
+        if (plane.noise <= 2 * noise                         # curved surface such as a back is no floor
+                and (np.mean(height < -WIDEST / 2) <= most_below or _is_pedestal(plane, points))
+                and _area_of_cells(plane.flat(points[on_it]), WIDEST) >= min_area):
+            return plane
+    return None
+
+
+def _is_pedestal(plane: Plane, points: np.ndarray) -> bool:
+    """Test whether the points (n, 3) behind a plane are a pedestal: below its own outline, and not as high as a leg."""
+    height, flat = plane.height(points), plane.flat(points)
+    below, top = height < -WIDEST, flat[np.abs(height) < WIDEST / 2]
+    if not len(top) or not below.any() or height.min() < -HIGHEST:
+        return False
+    # the sides are at the rim; the top may be hidden by the feet
+    outside = ~inside_outline(flat[below], top, bridge=WIDEST)
+    outside[outside] = cKDTree(top).query(flat[below][outside])[0] > 2 * WIDEST
+    return bool(outside.mean() < 0.02)                                       # 2%: specks and reflections
 
 
 def local_noise(points: np.ndarray, rng: np.random.Generator) -> float:
@@ -131,9 +152,8 @@ def _fit(points: np.ndarray) -> Plane:
     return Plane(axes[:, 0], float(axes[:, 0] @ centre), float(np.sqrt(max(spread[0], 0.0))))
 
 
-def _refine(plane: Plane, points: np.ndarray) -> Plane:
-    """Refine a plane on ever closer points; the noise is a robust estimate, so that feet do not count."""
-    band = WIDEST
+def _refine(plane: Plane, points: np.ndarray, band: float) -> Plane:
+    """Refine a plane on ever closer points, at first within `band` metres; feet hardly count in its noise."""
     for _ in range(8):
         height = plane.height(points)
         near = points[np.abs(height) < band]

@@ -96,18 +96,26 @@ def unit_named(text: str) -> str | None:
 
 
 def metres_of(unit: str | None) -> float:
-    """Return the length of a unit in metres, 1 without a unit; ValueError for an unknown one."""
-    unit = "m" if unit is None else unit
-    if unit not in UNITS:
-        raise ValueError(f"unit: expected one of {', '.join(UNITS)}, got {unit!r}")
-    return UNITS[unit]
+    """Return the length of a unit in metres, 1 without a unit; ValueError for an unknown one.
+
+    A number written as text is the length itself, such as "0.3048" for feet.
+    """
+    if unit is None or unit in UNITS:
+        return UNITS[unit or "m"]
+    with contextlib.suppress(ValueError):
+        if 0 < float(unit) < FARTHEST:
+            return float(unit)
+    raise ValueError(f"unit: expected one of {', '.join(UNITS)}, or its length in metres, got {unit!r}")
+
+
+# Metres from end to end of a person, by unit: up to stretched arms; in millimetres from a bust or a toddler on. Nothing
+# that is scanned is so large in metres: 51 to 91 are inches, 92 to 230 centimetres, and from 400 on millimetres.
+PERSON = {"mm": (0.4, 2.3), "cm": (0.92, 2.3), "in": (1.3, 2.3)}
 
 
 def guess_unit(extent: float) -> str | None:
-    """Guess the unit, other than metres, in which `extent` is that of a person; None if none or several fit."""
-    person = 1.3, 2.3  # metres: from a half-grown child to stretched arms; 51 to 91 are inches, 130 to 230 cm
-    likely = [unit for unit in ("mm", "cm", "in") if person[0] <= extent * UNITS[unit] <= person[1]]
-    return likely[0] if len(likely) == 1 else None
+    """Guess the unit, other than metres, in which `extent` is that of a person; None if none fits."""
+    return next((unit for unit, (least, most) in PERSON.items() if least <= extent * UNITS[unit] <= most), None)
 
 
 def metres_per_unit(path: Path, points: np.ndarray, unit: str | None, smallest: float = 0.1, named: float = 1.0

@@ -18,7 +18,7 @@ from scipy.spatial import cKDTree
 from ..batch.opening import workspace
 from ..batch.room import Progress, TaskContext
 from ..batch.workspace import NothingMadeError, Task, Workspace
-from ..cli import MM, Output, Unit
+from ..cli import MM, Output, PersonUnit
 from ..console import Metric, Outcome, bar
 from ..geometry import tables
 from ..geometry.files import name_of, read_mesh, read_scan
@@ -29,8 +29,11 @@ from ..geometry.mesh import Mesh, check_template
 from ..geometry.surface import OrientedPoints, Surface
 from ..geometry.target import orient_by_mesh, target_of
 from ..judgement import size
+from ..ranges import Axis
 from ..registration.matches import NORMALS
 from ..registration.person import average_person, find_landmarks
+from ..registration.schedule import RegistrationConfig
+from ..registration.unit import known_unit
 from ..synthetic.landmarks import landmarks as landmarks_of_people
 from .cli import ScansArg
 from .page import judge_set, judge_whole
@@ -78,7 +81,7 @@ class ScanLandmarks:
 
 
 def landmark_scans(scans: ScansArg, output: Output, template: Path | None = None, format: Format = "json",
-                   unit: Unit | None = None, *, space: Workspace) -> Outcome:
+                   unit: PersonUnit | None = None, up: Axis | None = None, *, space: Workspace) -> Outcome:
     """Named landmarks for scans that nobody clicked, with expected errors, in files of the program that you use.
 
     A template is registered to every scan, and its landmarks go along. Files have only landmarks where the scan has
@@ -94,7 +97,9 @@ def landmark_scans(scans: ScansArg, output: Output, template: Path | None = None
             landmarks that are not in that file, too; without a template it is the built-in people's average body.
         format: Of the landmark files: json, pp (MeshLab), mrk.json and fcsv (3D Slicer), scalismo.json, csv,
             lnd (CAESAR), txt.
-        unit: Unit of the scans, and of the landmark files; the table is in metres.
+        unit: Unit of the scans, and of the landmark files; "unknown": it is found together with the person. The table
+            is in metres.
+        up: The axis of the scans that points up, where it is known.
     """
     tasks = find_scans(scans) if scans.is_dir() else [ScanTask(name_of(scans), scans, subject=name_of(scans))]
     with ExitStack() as bars:
@@ -102,7 +107,7 @@ def landmark_scans(scans: ScansArg, output: Output, template: Path | None = None
             "finding the parts of a person", "registering scans", "finding landmarks of the template",
             "writing landmarks"))
         body, marks = template_and_landmarks(template, space, finding)
-        config = PrepareConfig(ScanSettings(unit=unit))
+        config = PrepareConfig(ScanSettings(RegistrationConfig(up=up), unit))
         return write_all(tasks, body, marks, config, format, space, registering, naming, writing)
 
 
@@ -188,11 +193,12 @@ class FindPoints:
 
     def __call__(self, inputs: ScanAndBody, context: TaskContext) -> ScanLandmarks:
         """Find the landmarks of one scan."""
-        scan, body = read_scan(inputs.scan, inputs.unit), read_mesh(inputs.mesh, unit="m")
+        unit = known_unit(inputs.scan, inputs.unit)
+        scan, body = read_scan(inputs.scan, unit), read_mesh(inputs.mesh, unit="m")
         points, gaps = points_on_scan(scan, body, np.array(list(self.landmarks.values())))
         landmarks = ScanLandmarks(tuple(self.landmarks), points, gaps, size(body))
         write_landmarks(context.folder / inputs.file, {name: point for name, point, there in zip(
-            landmarks.names, points, landmarks.seen, strict=True) if there}, inputs.unit)
+            landmarks.names, points, landmarks.seen, strict=True) if there}, unit)
         return landmarks
 
 

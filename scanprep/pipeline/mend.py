@@ -18,6 +18,7 @@ from ..dataset import RegisteredSet
 from ..geometry.landmark_names import TEN
 from ..judgement import Judgement
 from ..registration.figures import Verdict
+from ..registration.unit import UNKNOWN
 from ..viewer.app import Send
 from ..viewer.clicked import Clicked
 from ..viewer.messages import Message
@@ -68,6 +69,7 @@ class MendApp(ResultsApp):
     def _load_clicked(self, task: ScanTask, ending: str) -> Clicked:
         """Load a scan and its landmarks from the file that `scape prep run` reads."""
         unit = self.call.config.scan.unit
+        unit = "m" if unit == UNKNOWN else unit               # landmarks are in the numbers of the scan then
         if task.landmarks is not None:
             return Clicked.load(task.scan, ending, unit, task.landmarks)
         return Clicked(task.scan, (self.call.landmarks or task.scan.parent) / (task.name + ending), unit)

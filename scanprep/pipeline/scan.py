@@ -15,7 +15,7 @@ from ..correspondence.search import CorrelatedConfig
 from ..geometry.files import read_scan, write_mesh
 from ..geometry.landmarks import check_on_surface, read_landmarks, try_match_landmarks
 from ..geometry.mesh import Mesh
-from ..judgement import extent, implausible_body
+from ..judgement import WrongScaleError, check_unit, implausible_body
 from ..ranges import FLAG, Settings
 from ..registration.figures import ScanFigures, figures_of
 from ..registration.ground import with_soles
@@ -25,6 +25,7 @@ from ..registration.nonrigid import LedRegistration, register, registration_prob
 from ..registration.person import PersonParts, stature
 from ..registration.repair import repair_limbs
 from ..registration.schedule import RegistrationConfig
+from ..registration.unit import known_unit
 from ..registration.unmarked import register_by_any
 from ..threads import one_thread
 from .rivals import RIVALS, TWO_BODIES, rival_file, save_figures
@@ -40,8 +41,8 @@ class ScanSettings(Settings):
     Attributes
     ----------
     registration : RegistrationConfig
-    unit : 'm', 'mm', 'cm' or 'in', optional
-        Of the scan and its landmarks, where the files cannot tell.
+    unit : 'm', 'mm', 'cm', 'in' or 'unknown', optional
+        Of the scan and its landmarks, where the files cannot tell; 'unknown': it is found together with the person.
     through : str
         What leads the template to scans without landmarks, or with fewer than seven: 'auto', the built-in people where
         the template is a person; the file of a model; 'none', correspondences; or 'pose', nothing on any scan, all of
@@ -56,7 +57,7 @@ class ScanSettings(Settings):
     """
 
     registration: RegistrationConfig = field(default_factory=RegistrationConfig)
-    unit: Annotated[Literal["m", "mm", "cm", "in"] | None, FLAG] = None
+    unit: Annotated[Literal["m", "mm", "cm", "in", "unknown"] | None, FLAG] = None
     through: Annotated[str, FLAG] = "auto"
     correspondences: CorrelatedConfig = field(default_factory=CorrelatedConfig)
     clean: CleanScanConfig | None = None
@@ -88,12 +89,10 @@ def register_scan(task: ScanTask, template: Mesh, template_landmarks: dict[str, 
     """
     start = time.perf_counter()
     with one_thread():
-        scan, removed = read_scan(task.scan, settings.unit), 0.0
-        # a factor of 30 is a wrong unit, refused before minutes of work; a room around the body, or one hand, passes
-        ratio = extent(scan.vertices if isinstance(scan, Mesh) else scan) / extent(template.vertices)
-        if not 1 / 30 < ratio < 30:
-            raise ValueError(f"{task.scan}: it is {ratio:.3g} times as large as the template: the wrong unit? (--unit)")
-        landmarks = _landmarks(task, scan, template_landmarks, settings)
+        unit = known_unit(task.scan, settings.unit)
+        scan, removed = read_scan(task.scan, unit), 0.0
+        check_unit(scan, template.vertices, f"{task.scan}: it is")
+        landmarks = None if settings.through == "pose" else _landmarks(task, scan, template_landmarks, unit)
         # remove floor and clutter, if asked for or if there are no landmarks to keep the body apart
         if settings.clean is not None:
             cleaned = clean_scan(scan, settings.clean, None if landmarks is None else landmarks[1])
@@ -110,6 +109,8 @@ def register_scan(task: ScanTask, template: Mesh, template_landmarks: dict[str, 
             try:
                 led = register_by_any(template, scan, landmarks, lead, parts, settings.registration,
                                       settings.correspondences, progress, task.model)
+            except WrongScaleError as error:
+                raise WrongScaleError(f"{task.scan}: {error}") from None
             except ValueError as error:
                 raise ValueError(f"{error} (landmarks beside the scan need no ends of limbs)") from None
         # refuse a registration that is not on the scan, or has left and right limbs exchanged
@@ -193,11 +194,11 @@ def size_doubts(template: Mesh, parts: PersonParts, vertices: np.ndarray) -> tup
     return tuple(PlausibilityIssue(2.0 if sized.problems else 1.0, reason) for reason in sized.reasons)
 
 
-def _landmarks(task: ScanTask, scan: Mesh | np.ndarray, template_landmarks: dict[str, int], settings: ScanSettings
+def _landmarks(task: ScanTask, scan: Mesh | np.ndarray, template_landmarks: dict[str, int], unit: str | None
                ) -> Landmarks | None:
     """Return vertices of the template and points of the scan that correspond, or None where there are too few."""
-    if task.landmarks is None or settings.through == "pose":
+    if task.landmarks is None:
         return None
-    points = read_landmarks(task.landmarks, scan, settings.unit)
+    points = read_landmarks(task.landmarks, scan, unit)
     check_on_surface(task.landmarks, points, scan.vertices if isinstance(scan, Mesh) else scan)
     return try_match_landmarks(task.landmarks, template_landmarks, points)

@@ -9,7 +9,7 @@ import numpy as np
 from ..alignment.icp import RigidConfig, align_landmarks, align_rigid, alignment_problem
 from ..arguments import Place
 from ..cleaning.clean_scan import take_clutter
-from ..cli import MM, MeshArg, Output, ScanArg, Unit
+from ..cli import MM, MeshArg, Output, PersonUnit, ScanArg, Unit
 from ..console import Metric, Outcome, bar
 from ..correspondence.correlated import find_correspondences
 from ..correspondence.correspondences import (
@@ -28,7 +28,7 @@ from ..geometry.landmarks import (
     try_match_landmarks,
 )
 from ..geometry.mesh import Mesh
-from ..judgement import Judgement, implausible_body, size
+from ..judgement import Judgement, check_unit, implausible_body, size
 from .figures import UNSEEN, figures_of, review
 from .ground import soles_row, with_soles
 from .lead import lead_of
@@ -37,6 +37,7 @@ from .nonrigid import LedRegistration, Registration, register, registration_prob
 from .person import PersonParts, person_parts, stature
 from .repair import repair_limbs
 from .schedule import RegistrationConfig
+from .unit import known_unit
 from .unmarked import FEW, RIVAL, register_by_any
 
 
@@ -77,7 +78,7 @@ def align(source: MeshArg, target: Annotated[Path, Place("TARGET")], output: Out
 
 
 def _read_landmarks(template: Path, body: Mesh, scan: Path, data: Mesh | np.ndarray, landmarks: Path | None,
-                    template_landmarks: Path | None, unit: Unit | None) -> tuple[Landmarks | None, list[Metric]]:
+                    template_landmarks: Path | None, unit: str | None) -> tuple[Landmarks | None, list[Metric]]:
     """Read the landmarks that template and scan share, and the table rows that report them.
 
     The scan's landmarks come from the named file, else from the file beside the scan; the word none means no landmarks.
@@ -92,7 +93,7 @@ def _read_landmarks(template: Path, body: Mesh, scan: Path, data: Mesh | np.ndar
 
 
 def correspond(scan: ScanArg, template: Path, output: Output, landmarks: Path | None = None,
-               template_landmarks: Path | None = None, unit: Unit | None = None,
+               template_landmarks: Path | None = None, unit: PersonUnit | None = None,
                config: CorrelatedConfig = CorrelatedConfig()) -> Outcome:
     """From a few landmarks, or none, to nearly two hundred pairs of places on template and scan.
 
@@ -105,11 +106,13 @@ def correspond(scan: ScanArg, template: Path, output: Output, landmarks: Path | 
         landmarks: Landmarks of the scan: three at least, spread over the body; else the file of its name beside it.
             With none, or the word none, the ends of the limbs are looked for.
         template_landmarks: Landmarks of the template; else the file of its name beside it.
-        unit: Unit of the scan and its landmarks.
+        unit: Unit of the scan and its landmarks; "unknown": it is found together with the person.
         config: Settings.
     """
-    body, data = read_mesh(template), read_scan(scan, unit)
-    pairs, led_by = _read_landmarks(template, body, scan, data, landmarks, template_landmarks, unit)
+    body, units = read_mesh(template), known_unit(scan, unit)
+    data = read_scan(scan, units)
+    check_unit(data, body.vertices, f"{scan}: it is")
+    pairs, led_by = _read_landmarks(template, body, scan, data, landmarks, template_landmarks, units)
     with bar("finding correspondences") as progress:
         pairs_found = find_correspondences(body, data, pairs, config, progress)
     write_correspondences(output, pairs_found)
@@ -121,7 +124,7 @@ def correspond(scan: ScanArg, template: Path, output: Output, landmarks: Path | 
 
 
 def register_one(scan: ScanArg, template: Path, output: Output, landmarks: Path | None = None,
-                 template_landmarks: Path | None = None, through: str = "auto", unit: Unit | None = None,
+                 template_landmarks: Path | None = None, through: str = "auto", unit: PersonUnit | None = None,
                  config: RegistrationConfig = RegistrationConfig()) -> Outcome:
     """Bend the template onto one scan.
 
@@ -137,13 +140,15 @@ def register_one(scan: ScanArg, template: Path, output: Output, landmarks: Path 
         through: What leads the template where landmarks are fewer than seven: a model file that finds the body on the
             scan; auto, the built-in people where the template is a person, else pose; a .json file of
             scape prep correspond; none, correspondences; pose: without landmarks it must be near the template's pose.
-        unit: Unit of the scan and its landmarks.
+        unit: Unit of the scan and its landmarks; "unknown": it is found together with the person.
         config: Settings.
     """
-    body, data = read_mesh(template), read_scan(scan, unit)
+    body, units = read_mesh(template), known_unit(scan, unit)
+    data = read_scan(scan, units)
+    check_unit(data, body.vertices, f"{scan}: it is")
     correspondence_file = Path(through) if through.endswith(".json") else None
     pairs, led_by = (None, [Metric("landmarks", 0)]) if correspondence_file and landmarks is None else _read_landmarks(
-        template, body, scan, data, landmarks, template_landmarks, unit)
+        template, body, scan, data, landmarks, template_landmarks, units)
     # with too few landmarks a body model proposes where the body is
     lead = None
     if correspondence_file is None and through != "pose" and (pairs is None or len(pairs[0]) < FEW):

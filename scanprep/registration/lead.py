@@ -14,6 +14,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from ..geometry.mesh import Mesh
+from ..ranges import Axis
 from ..skeleton.tree import Skeleton
 from .person import PersonParts, has_limbs
 
@@ -23,14 +24,18 @@ class Lead(Protocol):
 
     The next body is sought only when it is asked for, so the first one comes fast.
     Landmarks are vertices (L,) of the template and points (L, 3), metres. `model` is the path of the model file, where
-    it differs from the path the lead was made with.
+    it differs from the path the lead was made with. `up` is the axis of the scan that points up, where it is known.
     """
 
     name: str
     parts: PersonParts | None        # of the template, where the model is of people
 
     def __call__(self, scan: Mesh | np.ndarray, landmarks: tuple[np.ndarray, np.ndarray] | None = None,
-                 model: Path | None = None) -> Iterable[np.ndarray]: ...
+                 model: Path | None = None, up: Axis | None = None) -> Iterable[np.ndarray]: ...
+
+    def person_size(self, scan: Mesh | np.ndarray) -> tuple[float, float]:
+        """Find the length of a scan's unit and the stature of the person in it, both in metres."""
+        ...
 
 
 def lead_of(template: Mesh, through: str, progress: Callable[[int, int], None] | None = None) -> Lead | None:

@@ -2,9 +2,9 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Annotated, Any
 
-from ..ranges import Cell, Count, Positive, Settings
+from ..ranges import FLAG, Axis, Cell, Count, Positive, Settings
 
 
 @dataclass(frozen=True)
@@ -147,6 +147,8 @@ class RegistrationConfig(Settings):
         How many other rolls are tried where limbs are anatomically impossible; 0 tries none.
     final_fit : FinalFitConfig or None
         The last pass: the surface follows the scan to its noise. None leaves it out.
+    up : 'x', '-x', 'y', '-y', 'z' or '-z', optional
+        The axis of the scan that points up, where it is known: people mostly stand, so a body model finds them better.
 
     Examples
     --------
@@ -158,6 +160,7 @@ class RegistrationConfig(Settings):
     rolls: int = 3
     final_fit: FinalFitConfig | None = field(default_factory=FinalFitConfig)
     method: str = "graph"
+    up: Annotated[Axis | None, FLAG] = None
 
     @property
     def near_stages(self) -> list[GraphStage]:

@@ -101,7 +101,7 @@ def register_by_any(template: Mesh, scan: Mesh | np.ndarray, landmarks: Landmark
     candidates = list[Candidate]()
     if lead is not None:
         way = ", ".join([*clicked, f"model {lead.name}"])
-        for vertices in lead(scan, landmarks, model):
+        for vertices in lead(scan, landmarks, model, config.up if config else None):
             fit = register(template, scan, landmarks, config, progress, start=vertices)
             candidates.append(Candidate(weigh_doubts(template, parts, fit), fit, way))
             if not candidates[-1].doubt:

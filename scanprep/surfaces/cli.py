@@ -9,7 +9,7 @@ import numpy as np
 from ..alignment.views import AlignViewsConfig, align_views, views_doubts, views_problem
 from ..arguments import Called, Place, UsageError
 from ..cleaning.clean_scan import CleanScanConfig, clean_scan, cleaning_doubts
-from ..cli import MM, MeshArg, Output, ScanArg, Unit, about_mesh
+from ..cli import MM, MeshArg, Output, PersonUnit, ScanArg, Unit, about_mesh
 from ..console import Metric, Outcome, bar, say
 from ..dataset import RegisteredSet
 from ..decimation.decimate import DecimateConfig, decimate
@@ -17,7 +17,6 @@ from ..decimation.registered_set import DecimateSetConfig, write_decimated_set
 from ..fusion.tsdf import MergeConfig, merge_views
 from ..geometry import storage
 from ..geometry.files import (
-    UNITS,
     PointCloud,
     common_unit,
     is_scan,
@@ -31,11 +30,13 @@ from ..geometry.files import (
     write_mesh,
     write_points,
 )
+from ..geometry.format_common import metres_of
 from ..geometry.landmarks import landmarks_beside, read_landmark_vertices, read_landmarks, write_landmarks
 from ..geometry.mesh import Mesh, template_problem
 from ..judgement import Judgement
 from ..ranges import Faces
 from ..registration.lead import find_scanned_person
+from ..registration.unit import known_unit
 from ..repair.hole_filling import FillConfig, FilledHole, fill_holes, fill_report, filling_judgement
 from ..repair.manifold import repair
 from ..words import number_of
@@ -47,7 +48,7 @@ ViewsArg = Annotated[Path, Place("VIEWS")]
 
 
 def template(scans: ScansArg, output: Output, faces: Faces = 14000, landmarks: Path | None = None,
-             unit: Unit | None = None) -> Outcome:
+             unit: PersonUnit | None = None) -> Outcome:
     """Make a template of your best scan: the body alone, repaired, its holes filled, decimated.
 
     Landmarks are carried to it. Several files are views of one moment, which are aligned and merged; point clouds are
@@ -61,7 +62,8 @@ def template(scans: ScansArg, output: Output, faces: Faces = 14000, landmarks: P
         output: Mesh to write; its landmarks go beside it.
         faces: Triangles of the template.
         landmarks: Landmarks of the scan; else the file of its name beside it.
-        unit: Unit of the scans, their cameras and landmarks.
+        unit: Unit of the scans, their cameras and landmarks; "unknown": it is found together with the person in the
+            first scan.
     """
     if not scans:
         raise ValueError("SCAN: expected a scan of the whole body, or views of it, got none")
@@ -69,7 +71,7 @@ def template(scans: ScansArg, output: Output, faces: Faces = 14000, landmarks: P
     rows, doubts, marks = list[Metric](), list[str](), dict[str, int]()
     # views with known cameras are merged; anything else is aligned, meshed or taken as it is
     if len(scans) == 1 and (scans[0] / "cameras.json").exists():
-        seen = _read_views(scans[0], unit)
+        seen = _read_views(scans[0], known_unit(list_meshes(scans[0])[0], unit))
         with bar("making the template") as progress:
             made = make_template(seen, faces, progress=progress)
         rows = [Metric("views", len(seen))]
@@ -77,12 +79,13 @@ def template(scans: ScansArg, output: Output, faces: Faces = 14000, landmarks: P
         paths = [path for given in scans for path in ([given] if not given.is_dir() else list_files(
             given, lambda path: is_scan(path) and ".landmarks." not in path.name, "views, meshes or point clouds"))]
         # meshing point clouds needs their normals
-        views = [found if isinstance(found := read_scan(path, unit), Mesh) else read_points(path, unit)
+        units = known_unit(paths[0], unit)
+        views = [found if isinstance(found := read_scan(path, units), Mesh) else read_points(path, units)
                  for path in paths]
         scan = views[0] if len(views) == 1 else views_without_cameras(views)
         path = landmarks or (landmarks_beside(paths[0]) if len(paths) == 1 else None)
         surface = scan if isinstance(scan, Mesh) else scan.points
-        places = {} if path is None else read_landmarks(path, surface, unit)
+        places = {} if path is None else read_landmarks(path, surface, units)
         with bar("making the template") as progress:
             person = find_scanned_person(surface)
             done = template_of_scan(scan, faces, landmarks=np.array(list(places.values())) if places else None,
@@ -139,7 +142,7 @@ def _manifold(mesh: Mesh, path: Path) -> Mesh:
     return mended
 
 
-def clean(scan: ScanArg, output: Output, landmarks: Path | None = None, unit: Unit | None = None,
+def clean(scan: ScanArg, output: Output, landmarks: Path | None = None, unit: PersonUnit | None = None,
           config: CleanScanConfig = CleanScanConfig()) -> Outcome:
     """Keep the body of a raw scan; floor, furniture and specks go.
 
@@ -149,12 +152,13 @@ def clean(scan: ScanArg, output: Output, landmarks: Path | None = None, unit: Un
         scan: Mesh or point cloud.
         output: File to write, a mesh or a point cloud as the scan is.
         landmarks: Landmarks of the scan, where the body is not its largest piece.
-        unit: Unit of the scan and its landmarks.
+        unit: Unit of the scan and its landmarks; "unknown": it is found together with the person.
         config: Settings.
     """
-    raw = read_scan(scan, unit)
+    units = known_unit(scan, unit)
+    raw = read_scan(scan, units)
     mesh = raw if isinstance(raw, Mesh) else None
-    places = read_landmarks(landmarks, mesh, unit) if landmarks else {}
+    places = read_landmarks(landmarks, mesh, units) if landmarks else {}
     found = clean_scan(raw, config, np.array(list(places.values())) if places else None)
     if isinstance(found.scan, Mesh):
         write_mesh(output, found.scan)
@@ -306,7 +310,7 @@ def _as_template(mesh: Mesh) -> Judgement:
     return Judgement.of(check=[] if problem is None else [f"not usable as a template: {problem}"])
 
 
-def _read_views(folder: Path, unit: Unit | None) -> list[tuple[Mesh, np.ndarray]]:
+def _read_views(folder: Path, unit: str | None) -> list[tuple[Mesh, np.ndarray]]:
     """Read the range meshes of a folder with the positions (3,), metres, of their cameras."""
     cameras = folder / "cameras.json"
     where = storage.read_json(cameras, "camera positions {name: [x, y, z]}")
@@ -317,5 +321,5 @@ def _read_views(folder: Path, unit: Unit | None) -> list[tuple[Mesh, np.ndarray]
             raise ValueError(f"none for {', '.join(missing)}")
         where = {name: np.array(place, dtype=np.float64) for name, place in where.items()}
         common = common_unit(paths, unit)
-        places = [UNITS[common or "m"] * storage.numbers(where, name_of(path), 3) for path in paths]
+        places = [metres_of(common) * storage.numbers(where, name_of(path), 3) for path in paths]
     return [(read_mesh(path, common), place) for path, place in zip(paths, places, strict=True)]
