@@ -9,7 +9,6 @@ import numpy as np
 from model.body import BodyModel
 from model.linear import Subject
 from scanprep.arguments import Alias, Called
-from scanprep.cli import Unit
 from scanprep.console import say
 
 ModelOrNone = Annotated[Path | None, Alias("-m")]
@@ -25,7 +24,7 @@ def read_model(path: Path | None) -> tuple[BodyModel, str]:
     return load_model(path or BUILT_IN), str(path or BUILT_IN)
 
 
-def body_of(model: BodyModel, subject: str | None, unit: Unit | None) -> BodyModel | Subject:
+def body_of(model: BodyModel, subject: str | None, unit: str | None) -> BodyModel | Subject:
     """Return the model where the person's shape is to be found, else a body of known shape (--subject)."""
     if subject is None and model.n_betas:
         return model
@@ -49,7 +48,7 @@ def marks_of_template(model: BodyModel, file: Path | None, name: str, wanted: bo
     return {name: int(vertex) for name, vertex in stored.items()}
 
 
-def read_landmark_pairs(model: BodyModel, name: str, scan: Path, template: Path | None, unit: Unit | None
+def read_landmark_pairs(model: BodyModel, name: str, scan: Path, template: Path | None, unit: str | None
                         ) -> tuple[np.ndarray, np.ndarray] | None:
     """Return vertices (L,) and points (L, 3) of landmarks that file and model share; None where too few."""
     from scanprep.geometry.landmarks import read_landmarks, try_match_landmarks

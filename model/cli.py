@@ -101,7 +101,7 @@ def import_file(model: ModelArg, output: Output) -> Outcome:
         Metric("parts", ", ".join(imported.skeleton.names))], judgement=Judgement())
 
 
-def read_body(path: Path, template: Mesh, unit: Unit | None = None) -> Mesh:
+def read_body(path: Path, template: Mesh, unit: str | None = None) -> Mesh:
     """Read a mesh in the triangles of a model's template; ValueError for a mesh with other triangles."""
     body = read_mesh(path, unit)
     if not np.array_equal(body.faces, template.faces):

@@ -61,7 +61,7 @@ def run(function: Callable[..., Outcome], prog: str, argv: list[str]) -> int:
             # an error: what failed, in one line each, then the error itself
             for failure in getattr(error, "failures", ()):
                 say(call.real(f"{prog}: failed: {call.arguments.as_flags(failure)}") if call else failure)
-            line = _error_line(error)
+            line = _error_line(error, call)
             say(f"{prog}: {line if call is None else call.real(call.arguments.as_flags(line))}")
             return 2 if isinstance(error, UsageError) else exit_code
     # done: the verdict first, then the table, where the output is, what to do next, and what failed on the way
@@ -295,11 +295,12 @@ def _notes(prog: str) -> Iterator[tuple[list[Callable[[str], str]], list[str]]]:
         yield spelled, notes
 
 
-def _error_line(error: Exception) -> str:
+def _error_line(error: Exception, call: _Call | None) -> str:
     """Return one line for an error; an unexpected one says how to see the traceback."""
     text = " ".join(str(error).split())
     if isinstance(error, MemoryError):
-        return f"there is too little memory{': ' + text if text else ''}; give fewer triangles, or --workers 1"
+        fewer = ", or --workers 1" if call and any(each.flag == "--workers" for each in call.arguments.listed) else ""
+        return f"there is too little memory{': ' + text if text else ''}; give fewer triangles{fewer}"
     if isinstance(error, ValueError | OSError | ModuleNotFoundError):
         return text
     return f"unforeseen {type(error).__name__}: {text} (this is a fault of scapekit; {TRACEBACK}=1 shows where)"

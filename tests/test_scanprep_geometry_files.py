@@ -256,7 +256,7 @@ def test_a_giant_or_a_dwarf_of_no_certain_unit_warns_and_stays(tmp_path, factor,
     np.testing.assert_array_equal(mesh.vertices, person.vertices)
 
 
-def test_an_unknown_unit_is_refused(tmp_path):
+def test_an_unresolve_unit_is_refused(tmp_path):
     write_mesh(tmp_path / "a.ply", TETRAHEDRON)
     with pytest.raises(ValueError, match=r"unit: expected one of m, mm, cm, in, got 'feet'"):
         read_mesh(tmp_path / "a.ply", unit="feet")

@@ -13,7 +13,6 @@ from model.measurement.marks import MEASURED
 from model.measurement.tapes import Tapes
 from model.people import stature_and_volume
 from model.posing.cli import read_subject
-from scanprep.cli import Unit
 from scanprep.console import bar
 from scanprep.dataset import RegisteredSet
 from scanprep.geometry.files import list_meshes, name_of, read_mesh
@@ -22,6 +21,7 @@ from scanprep.geometry.landmarks import landmarks_beside, read_landmark_vertices
 from scanprep.geometry.mesh import Mesh
 from scanprep.judgement import implausible_body
 from scanprep.registration.person import find_landmarks
+from scanprep.registration.unit import resolve_unit
 from scanprep.words import number_of
 
 from ..partial.completion import load_completion
@@ -46,7 +46,7 @@ class Body:
     expected_error: np.ndarray | None = None
 
 
-def read_bodies(paths: Sequence[Path], model: BodyModel | None, unit: Unit | None) -> list[Body]:
+def read_bodies(paths: Sequence[Path], model: BodyModel | None, unit: str | None) -> list[Body]:
     """Read all bodies of files and folders, in the triangles of one template.
 
     Raises
@@ -77,7 +77,7 @@ def model_of(paths: Sequence[Path]) -> Path | None:
     return None
 
 
-def _bodies(path: Path, model: BodyModel | None, unit: Unit | None) -> Iterator[Body]:
+def _bodies(path: Path, model: BodyModel | None, unit: str | None) -> Iterator[Body]:
     """Yield the bodies of one file or folder."""
     if not path.exists():
         raise ValueError(f"{path}: there is no such file or folder")
@@ -101,14 +101,14 @@ def _bodies(path: Path, model: BodyModel | None, unit: Unit | None) -> Iterator[
             yield _of_file(mesh, model, unit)
 
 
-def _of_file(path: Path, model: BodyModel | None, unit: Unit | None) -> Body:
+def _of_file(path: Path, model: BodyModel | None, unit: str | None) -> Body:
     """Read the body of a mesh, or of betas."""
     if path.suffix.lower() in (".json", ".npz"):
         return _of_betas(name_of(path), path, model)
     error = None
     if path.name == "completed.ply" and (path.parent / COMPLETED).exists():
         error = load_completion(path.parent).expected_error
-    return Body(name_of(path), read_mesh(path, unit), path, expected_error=error)
+    return Body(name_of(path), read_mesh(path, resolve_unit(path, unit)), path, expected_error=error)
 
 
 def _of_betas(name: str, path: Path, model: BodyModel | None) -> Body:

@@ -19,7 +19,7 @@ from model.people import stature_and_volume
 from model.posing.transfer import own_body
 from model.shape_statistics import WORDS, Sex, shape_statistics
 from scanprep.arguments import Place, UsageError
-from scanprep.cli import MM, Output, Unit
+from scanprep.cli import MM, Output, PersonUnit
 from scanprep.console import Metric, Outcome, bar, say
 from scanprep.geometry.files import write_mesh
 from scanprep.geometry.mesh import Mesh
@@ -36,7 +36,7 @@ BodiesArg = Annotated[tuple[Path, ...], Place("[BODY ...]")]
 
 
 def measure_bodies(bodies: BodiesArg = (), *, output: Output, model: ModelOrNone = None,
-                   landmarks: Path | None = None, unit: Unit | None = None, to: tuple[str, ...] = (),
+                   landmarks: Path | None = None, unit: PersonUnit | None = None, to: tuple[str, ...] = (),
                    sex: Sex | None = None) -> Outcome:
     """Stature, girths, lengths, widths and weight of bodies, or the body that has some.
 
@@ -56,7 +56,7 @@ def measure_bodies(bodies: BodiesArg = (), *, output: Output, model: ModelOrNone
             brought into that pose first. Without any the template is that of the set, else the first body.
         landmarks: Where the landmarks are on the template, else those that the model keeps, or of the file beside the
             bodies.
-        unit: Unit of meshes.
+        unit: Unit of meshes; "unknown": it is found together with the person.
         to: Measurements that a body is to have, in metres, and its weight in kilograms, such as stature=1.80 weight=78;
             the rest is as probable as it can be, and told with its range. Needs a model, or takes the built-in one.
         sex: Also tell percentiles among the 4,082 men or 1,986 women of ANSUR II, of measurements that were taken in
@@ -196,7 +196,7 @@ def _make_body(to: Sequence[str], output: Path, model: BodyModel, name: str, lan
     title = output.stem
     page = measures_page([title], [made.vertices], [measure(made.vertices, tapes, tapes.axes)], tapes, made.sex)
     likely_section(page, made).write(output.with_suffix(".html"))
-    say(f"note: the betas are in {betas.name}, for --subject")
+    say(f"note: the betas are in {betas.name}; scape complete --subject takes them")
     # the table: what was asked for, how usual that is, and other common measurements
     rows = [_row(word, made.reached[word], made.sex, f", wanted {_number(word, value)}")
             for word, value in made.wanted.items()]

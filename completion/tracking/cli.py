@@ -12,11 +12,11 @@ from model.linear import Subject
 from model.people import person_judgement
 from scanprep.arguments import Place
 from scanprep.batch.workspace import Workspace
-from scanprep.cli import MM, Output, Unit
+from scanprep.cli import MM, Output, PersonUnit
 from scanprep.console import Metric, Outcome, bar, say
 from scanprep.geometry.farthest_points import spread_indices
 from scanprep.geometry.files import PointCloud
-from scanprep.judgement import Judgement, extent, unit_problem
+from scanprep.judgement import Judgement, check_unit, extent, unit_problem
 from scanprep.ranges import Positive
 
 from ..cli import ModelOrNone, body_of, read_landmark_pairs, read_model
@@ -29,7 +29,7 @@ FramesArg = Annotated[Path, Place("FRAMES")]
 
 def track_frames(frames: FramesArg, output: Output, model: ModelOrNone = None, rate: Positive = 30.0,
                  cameras: str | None = None, landmarks: Path | None = None, subject: str | None = None,
-                 template_landmarks: Path | None = None, unit: Unit | None = None, surfaces: bool = False,
+                 template_landmarks: Path | None = None, unit: PersonUnit | None = None, surfaces: bool = False,
                  config: TrackConfig = TrackConfig(), *, space: Workspace) -> Outcome:
     """The motion of a person from frames of points, without markers.
 
@@ -51,7 +51,7 @@ def track_frames(frames: FramesArg, output: Output, model: ModelOrNone = None, r
         subject: Whose body it is: "template" for the one the model's poses were learned from, betas in JSON or .npz,
             or a mesh in the model's triangles. Without it the shape is found from the first frames.
         template_landmarks: Where these landmarks are on the model's template; else those kept in the model.
-        unit: Unit of the frames and landmarks.
+        unit: Unit of the frames and landmarks; "unknown": it is found together with the person in the first frame.
         surfaces: Write the completed surface of every frame to surfaces/.
         config: Settings.
     """
@@ -61,7 +61,8 @@ def track_frames(frames: FramesArg, output: Output, model: ModelOrNone = None, r
     found = FrameFolder(frames, cameras, unit)
     loaded, name = read_model(model)
     body = body_of(loaded, subject, unit)
-    marked = None if landmarks is None else read_landmark_pairs(loaded, name, landmarks, template_landmarks, unit)
+    check_unit(_points(found[spread_indices(len(found), 3)[1]]), loaded.template.vertices, f"{frames}: a frame is")
+    marked = None if landmarks is None else read_landmark_pairs(loaded, name, landmarks, template_landmarks, found.unit)
     whose = Path(subject) if subject not in (None, "template") else subject
     # what kept frames depend on; smoothing comes after them
     key = space.digests.of(model or loaded, whose, marked, unit, replace(config, smoothing=0), rate, surfaces)

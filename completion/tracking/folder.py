@@ -22,6 +22,7 @@ from scanprep.geometry.files import (
     read_points,
     write_mesh,
 )
+from scanprep.registration.unit import resolve_unit
 
 from ..motion import Progress
 from .sequence import BodyTracker, TrackedFrame, TrackerState, without_points
@@ -46,7 +47,8 @@ class FrameFolder:
         step = int(np.gcd.reduce(np.diff(order))) if len(order) > 1 else 1
         filled = list(range(order[0], order[-1] + 1, step))
         self.numbers = filled if len(filled) <= 2 * len(order) else order
-        self.unit = common_unit([path for files in self._paths.values() for path in files.values()], self.unit)
+        files = [path for files in self._paths.values() for path in files.values()]
+        self.unit = resolve_unit(files[0], common_unit(files, self.unit))
 
     def __len__(self) -> int:
         return len(self.numbers)

@@ -21,7 +21,7 @@ from scanprep.geometry.files import list_meshes, name_of
 from scanprep.geometry.landmarks import read_landmark_vertices
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.tables import read_table
-from scanprep.judgement import carry_judgements
+from scanprep.judgement import WrongScaleError, carry_judgements
 from scanprep.registration.person import has_limbs
 from scanprep.skeleton.names import note_numbered_parts
 from scanprep.skeleton.roles import joint_in_words
@@ -170,7 +170,7 @@ def _bring_prior(body: Mesh, prior: str, step: Step) -> TemplatePrior | None:
         with bar(f"bringing the model {name} to the template") as progress:
             return step("prior", (body, name, model.template, model.info, model.pose_examples),
                         lambda: bring_prior(model, body, progress))
-    except ModelMismatchError as error:
+    except (ModelMismatchError, WrongScaleError) as error:
         if prior == "auto":
             warnings.warn(f"learned without the built-in people: {error}", stacklevel=2)
             return None

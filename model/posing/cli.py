@@ -11,6 +11,7 @@ from scanprep.cli import MeshArg, Output, Unit
 from scanprep.console import Metric, Outcome, bar
 from scanprep.geometry import rotations
 from scanprep.geometry.files import read_mesh, write_mesh
+from scanprep.geometry.format_common import UNKNOWN
 from scanprep.geometry.landmarks import read_landmark_vertices, read_landmarks
 from scanprep.geometry.storage import load_arrays, numbers, read_json, taking_apart
 from scanprep.judgement import HAND, Judgement, size
@@ -156,7 +157,7 @@ def _read_turns(path: Path) -> dict[str, np.ndarray]:
         return {name: numbers(turns, name, 3) for name in turns}
 
 
-def read_subject(model: BodyModel, given: Path | None, unit: Unit | None = None) -> Subject:
+def read_subject(model: BodyModel, given: Path | None, unit: str | None = None) -> Subject:
     """Read the subject named on the command line: betas in JSON or a motion file, or a mesh in the model's topology.
 
     Without a name it is the template's own body. A mesh gives a subject with all its detail, beyond betas.
@@ -166,7 +167,8 @@ def read_subject(model: BodyModel, given: Path | None, unit: Unit | None = None)
     if given.suffix in (".json", ".npz"):
         betas = betas_for(given, _read_betas(given), model)
         return model.subject(betas if betas is not None and len(betas) else None)
-    return subject_from_body(model, read_body(given, model.template, unit).vertices)
+    own = None if unit == UNKNOWN else unit                  # the unknown one is that of the scan or recording
+    return subject_from_body(model, read_body(given, model.template, own).vertices)
 
 
 def _read_betas(path: Path) -> np.ndarray:

@@ -13,7 +13,7 @@ from scanprep.batch.pool import Workers
 from scanprep.batch.room import TaskContext
 from scanprep.batch.workspace import Task, Workspace
 from scanprep.cleaning.clean_scan import clean_scan, cleaning_doubts
-from scanprep.cli import MM, Output, ScanArg, Unit
+from scanprep.cli import MM, Output, PersonUnit, ScanArg
 from scanprep.console import Metric, Outcome, bar, judgement_of, judgement_row, write_report
 from scanprep.folders import FolderCommand, do_one, figure
 from scanprep.geometry.files import write_mesh
@@ -26,6 +26,7 @@ from scanprep.pictures.textures import Texture, read_texture
 from scanprep.pipeline.scans import ScanTask, find_scans
 from scanprep.ranges import Positive
 from scanprep.registration.nonrigid import share_uncovered
+from scanprep.registration.unit import resolve_unit
 from scanprep.skeleton.roles import in_words
 from scanprep.surfaces.cloud import read_sound_surface
 
@@ -60,7 +61,7 @@ FINE = StatueConfig(displacement=DisplacementConfig(size=2048))
 
 
 def fit(scan: ScanArg, output: Output, features: Path | None = None, control: Path | None = None,
-        unit: Unit | None = None, config: StatueConfig = FINE, workers: Workers = Workers(), *,
+        unit: PersonUnit | None = None, config: StatueConfig = FINE, workers: Workers = Workers(), *,
         space: Workspace) -> Outcome:
     """A scan of one person becomes a statue: a control model that moves, with the detail of the scan as an image.
 
@@ -75,8 +76,8 @@ def fit(scan: ScanArg, output: Output, features: Path | None = None, control: Pa
         features: Joint centres and points of the surface by name, any landmark file; for a folder of scans, the folder
             of such files.
         control: Control model of your own: a skinned GLB, or control.npz of another statue; else the generic humanoid.
-        unit: Unit of the scan and the features; else metres with --features, and without them that in which the body
-            would be as tall as a person.
+        unit: Unit of the scan and the features; "unknown": it is found together with the person. Else metres with
+            --features, and without them that in which the body would be as tall as a person.
         workers: Who fits the scans of a folder.
     """
     work = Work(humanoid() if control is None else read_control(control), config, unit)
@@ -104,16 +105,17 @@ class Work:
 
     control: ControlModel
     config: StatueConfig
-    unit: Unit | None = None                                      # of scans and features, where files cannot tell
+    unit: str | None = None                                       # of scans and features, where files cannot tell
     command: str = field(default="", metadata={"digest": False})  # for the report of each scan of a folder
 
     def __call__(self, inputs: ScanTask, context: TaskContext) -> list[Metric]:
         """Fit the statue of some files into the folder of a room; the figures."""
         start = time.perf_counter()
-        scan, texture, rows, doubts = read_scan(inputs, self.unit)
+        unit = resolve_unit(inputs.scan, self.unit)
+        scan, texture, rows, doubts = read_scan(inputs, unit)
         joints = points = None
         if inputs.landmarks is not None:
-            joints, points = read_features(inputs.landmarks, self.control, scan, self.unit)
+            joints, points = read_features(inputs.landmarks, self.control, scan, unit)
             rows += [Metric("joints given", len(joints)), Metric("surface points given", len(points))]
         statue = fit_statue(scan, joints, points, self.control, self.config, context.report_progress, context.step)
         if texture is not None or scan.colors is not None:
@@ -216,7 +218,7 @@ def judge_statue(statue: FittedStatue, scan: Mesh, finest: Level, left_out: Sequ
     return found.merge(implausible_body(float(np.ptp(scan.vertices[:, statue.upright_axis]))))
 
 
-def read_scan(inputs: ScanTask, unit: Unit | None) -> tuple[Mesh, Texture | None, list[Metric], list[str]]:
+def read_scan(inputs: ScanTask, unit: str | None) -> tuple[Mesh, Texture | None, list[Metric], list[str]]:
     """Read the body of a scan and its texture in metres, with figures and doubts of the cleaning.
 
     Without a unit it is metres where features are given, which may be on anything, else that of a person.

@@ -16,6 +16,7 @@ from . import storage
 
 FARTHEST = 1e9                       # largest coordinate in any unit; no scan has more
 UNITS = {"m": 1.0, "mm": 1e-3, "cm": 1e-2, "in": 0.0254}
+UNKNOWN = "unknown"                  # the word for a unit that is to be found together with the person in a scan
 _SPELLED = {"metres": "m", "meters": "m", "millimetres": "mm", "millimeters": "mm", "centimetres": "cm",
             "centimeters": "cm", "inches": "in"}
 

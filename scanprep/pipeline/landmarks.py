@@ -33,7 +33,7 @@ from ..ranges import Axis
 from ..registration.matches import NORMALS
 from ..registration.person import average_person, find_landmarks
 from ..registration.schedule import RegistrationConfig
-from ..registration.unit import known_unit
+from ..registration.unit import resolve_unit
 from ..synthetic.landmarks import landmarks as landmarks_of_people
 from .cli import ScansArg
 from .page import judge_set, judge_whole
@@ -193,7 +193,7 @@ class FindPoints:
 
     def __call__(self, inputs: ScanAndBody, context: TaskContext) -> ScanLandmarks:
         """Find the landmarks of one scan."""
-        unit = known_unit(inputs.scan, inputs.unit)
+        unit = resolve_unit(inputs.scan, inputs.unit)
         scan, body = read_scan(inputs.scan, unit), read_mesh(inputs.mesh, unit="m")
         points, gaps = points_on_scan(scan, body, np.array(list(self.landmarks.values())))
         landmarks = ScanLandmarks(tuple(self.landmarks), points, gaps, size(body))

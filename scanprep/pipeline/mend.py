@@ -15,10 +15,10 @@ from ..batch.room import Progress
 from ..batch.workspace import HOME, Task, Workspace
 from ..console import Outcome
 from ..dataset import RegisteredSet
+from ..geometry.format_common import UNKNOWN
 from ..geometry.landmark_names import TEN
 from ..judgement import Judgement
 from ..registration.figures import Verdict
-from ..registration.unit import UNKNOWN
 from ..viewer.app import Send
 from ..viewer.clicked import Clicked
 from ..viewer.messages import Message

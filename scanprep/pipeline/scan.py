@@ -25,7 +25,7 @@ from ..registration.nonrigid import LedRegistration, register, registration_prob
 from ..registration.person import PersonParts, stature
 from ..registration.repair import repair_limbs
 from ..registration.schedule import RegistrationConfig
-from ..registration.unit import known_unit
+from ..registration.unit import resolve_unit
 from ..registration.unmarked import register_by_any
 from ..threads import one_thread
 from .rivals import RIVALS, TWO_BODIES, rival_file, save_figures
@@ -89,7 +89,7 @@ def register_scan(task: ScanTask, template: Mesh, template_landmarks: dict[str, 
     """
     start = time.perf_counter()
     with one_thread():
-        unit = known_unit(task.scan, settings.unit)
+        unit = resolve_unit(task.scan, settings.unit)
         scan, removed = read_scan(task.scan, unit), 0.0
         check_unit(scan, template.vertices, f"{task.scan}: it is")
         landmarks = None if settings.through == "pose" else _landmarks(task, scan, template_landmarks, unit)

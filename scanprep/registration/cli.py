@@ -37,7 +37,7 @@ from .nonrigid import LedRegistration, Registration, register, registration_prob
 from .person import PersonParts, person_parts, stature
 from .repair import repair_limbs
 from .schedule import RegistrationConfig
-from .unit import known_unit
+from .unit import resolve_unit
 from .unmarked import FEW, RIVAL, register_by_any
 
 
@@ -109,7 +109,7 @@ def correspond(scan: ScanArg, template: Path, output: Output, landmarks: Path | 
         unit: Unit of the scan and its landmarks; "unknown": it is found together with the person.
         config: Settings.
     """
-    body, units = read_mesh(template), known_unit(scan, unit)
+    body, units = read_mesh(template), resolve_unit(scan, unit)
     data = read_scan(scan, units)
     check_unit(data, body.vertices, f"{scan}: it is")
     pairs, led_by = _read_landmarks(template, body, scan, data, landmarks, template_landmarks, units)
@@ -143,7 +143,7 @@ def register_one(scan: ScanArg, template: Path, output: Output, landmarks: Path 
         unit: Unit of the scan and its landmarks; "unknown": it is found together with the person.
         config: Settings.
     """
-    body, units = read_mesh(template), known_unit(scan, unit)
+    body, units = read_mesh(template), resolve_unit(scan, unit)
     data = read_scan(scan, units)
     check_unit(data, body.vertices, f"{scan}: it is")
     correspondence_file = Path(through) if through.endswith(".json") else None

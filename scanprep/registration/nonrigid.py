@@ -273,7 +273,8 @@ def registration_problem(template: Mesh, scan: Mesh | np.ndarray, fit: Registrat
         "a part of the body only, which scape complete makes whole?" if far < 0.05 and not off else
         "landmarks of left and right exchanged, or of other places?" if marked and seen >= 0.01 else
         "a scan of something else, or too few points?" if marked else
-        "a scan of something else, or a pose far from the template's, which needs landmarks?")
+        "a scan of something else, its up axis to be named (--up), or a pose far from the template's, which needs "
+        "landmarks?")
     marks = f", its landmarks are {1000 * fit.landmark_rms:.0f} mm off" if marked else ""
     return (f"{100 * far:.0f}% of the scan lies off the template, {100 * seen:.2g}% of the template has data, "
             f"{100 * stretch:.0f}% of it is stretched or shrunk to the double or half{marks}; {cause}")

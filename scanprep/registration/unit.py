@@ -8,16 +8,16 @@ import numpy as np
 
 from ..cleaning.clean_scan import take_clutter
 from ..geometry.files import read_scan
+from ..geometry.format_common import UNKNOWN
 from ..geometry.mesh import Mesh
 from ..judgement import extent
 from .lead import lead_of
 from .person import average_person
 
-UNKNOWN = "unknown"                  # unit that is found together with the person
 DIAGONAL = 2.0                       # metres from corner to corner of the box around a person, roughly
 
 
-def known_unit(path: Path, unit: str | None) -> str | None:
+def resolve_unit(path: Path, unit: str | None) -> str | None:
     """Return a unit as it is, and for "unknown" the metres of one unit of the scan, as a number for all readers.
 
     The person in it becomes as tall as people of that build are, with a UserWarning that says how tall.

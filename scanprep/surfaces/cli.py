@@ -36,7 +36,7 @@ from ..geometry.mesh import Mesh, template_problem
 from ..judgement import Judgement
 from ..ranges import Faces
 from ..registration.lead import find_scanned_person
-from ..registration.unit import known_unit
+from ..registration.unit import resolve_unit
 from ..repair.hole_filling import FillConfig, FilledHole, fill_holes, fill_report, filling_judgement
 from ..repair.manifold import repair
 from ..words import number_of
@@ -71,7 +71,7 @@ def template(scans: ScansArg, output: Output, faces: Faces = 14000, landmarks: P
     rows, doubts, marks = list[Metric](), list[str](), dict[str, int]()
     # views with known cameras are merged; anything else is aligned, meshed or taken as it is
     if len(scans) == 1 and (scans[0] / "cameras.json").exists():
-        seen = _read_views(scans[0], known_unit(list_meshes(scans[0])[0], unit))
+        seen = _read_views(scans[0], resolve_unit(list_meshes(scans[0])[0], unit))
         with bar("making the template") as progress:
             made = make_template(seen, faces, progress=progress)
         rows = [Metric("views", len(seen))]
@@ -79,7 +79,7 @@ def template(scans: ScansArg, output: Output, faces: Faces = 14000, landmarks: P
         paths = [path for given in scans for path in ([given] if not given.is_dir() else list_files(
             given, lambda path: is_scan(path) and ".landmarks." not in path.name, "views, meshes or point clouds"))]
         # meshing point clouds needs their normals
-        units = known_unit(paths[0], unit)
+        units = resolve_unit(paths[0], unit)
         views = [found if isinstance(found := read_scan(path, units), Mesh) else read_points(path, units)
                  for path in paths]
         scan = views[0] if len(views) == 1 else views_without_cameras(views)
@@ -155,7 +155,7 @@ def clean(scan: ScanArg, output: Output, landmarks: Path | None = None, unit: Pe
         unit: Unit of the scan and its landmarks; "unknown": it is found together with the person.
         config: Settings.
     """
-    units = known_unit(scan, unit)
+    units = resolve_unit(scan, unit)
     raw = read_scan(scan, units)
     mesh = raw if isinstance(raw, Mesh) else None
     places = read_landmarks(landmarks, mesh, units) if landmarks else {}

@@ -11,7 +11,7 @@ from model.posing.cli import read_subject
 from scanprep.arguments import Place, UsageError
 from scanprep.batch.pool import Workers
 from scanprep.batch.workspace import Results, Task, Workspace
-from scanprep.cli import Output, Unit
+from scanprep.cli import Output, PersonUnit
 from scanprep.console import JUDGEMENT, Metric, Outcome
 from scanprep.folders import FolderCommand, as_line, do_one, figure
 from scanprep.geometry.files import list_files
@@ -19,7 +19,7 @@ from scanprep.geometry.storage import read_json
 from scanprep.ranges import BETAS, Positive
 
 from ...cli import ModelOrNone, body_of, read_model
-from ..files.markers import READERS
+from ..files.markers import READERS, resolve_marker_unit
 from ..marker_sets.named import layout_or_file
 from ..pose.follow import AnimateConfig
 from ..subject.person import PersonConfig
@@ -30,7 +30,7 @@ MarkersArg = Annotated[Path, Place("MARKERS")]
 
 
 def animate_markers(markers: MarkersArg, output: Output, model: ModelOrNone = None, layout: str | None = None,
-                    subject: str | None = None, unit: Unit | None = None, rate: Positive | None = None,
+                    subject: str | None = None, unit: PersonUnit | None = None, rate: Positive | None = None,
                     subject_prefix: str | None = None, retarget_to: Path | None = None, betas_to: Path | None = None,
                     unlabelled: bool = False, config: AnimateConfig = AnimateConfig(),
                     person: PersonConfig = PersonConfig(), workers: Workers = Workers(), *, space: Workspace
@@ -63,7 +63,8 @@ def animate_markers(markers: MarkersArg, output: Output, model: ModelOrNone = No
         subject: Whose body it is: "markers" to find it from them, "template" for the one the model's poses were learned
             from, betas in JSON or .npz, or a mesh in the model's triangles. Without it "markers" where the model has
             betas.
-        unit: Unit of the markers, where the file cannot tell; of a BVH, else cm.
+        unit: Unit of the markers, where the file cannot tell; "unknown": that in which they span a person. Of a BVH,
+            else cm.
         rate: Frames a second, where the file does not say or says it wrongly; of key poses, else 30.
         subject_prefix: Whose markers, in a file with several people: what stands before the colon of their labels.
             Several, as Head,Trunk, are of one person.
@@ -90,12 +91,13 @@ def animate_markers(markers: MarkersArg, output: Output, model: ModelOrNone = No
     if unlabelled and subject_prefix:
         raise UsageError("--unlabelled: markers without names have no --subject-prefix")
     # model, subject and all that the files share
+    units = resolve_marker_unit([markers], unit)
     loaded, name = read_model(model)
     body = loaded if subject == "markers" else body_of(loaded, subject, unit)
     work = AnimateTask(loaded, name, None if layout is None else layout_or_file(layout),
                        body if isinstance(body, Subject) else None,
                        None if retarget_to is None else read_subject(loaded, retarget_to, unit),
-                       None if betas_to is None else read_betas_to(betas_to, loaded.n_betas), unit, subject_prefix,
+                       None if betas_to is None else read_betas_to(betas_to, loaded.n_betas), units, subject_prefix,
                        rate,
                        config, person, unlabelled)
     settings = {"animate": config, "person": person, "model": name}

@@ -3,14 +3,14 @@ from __future__ import annotations
 
 import warnings
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from scanprep.geometry import storage
-from scanprep.geometry.format_common import FARTHEST, UNITS, metres_of, unit_named
+from scanprep.geometry.format_common import FARTHEST, UNITS, UNKNOWN, guess_unit, metres_of, unit_named
 from scanprep.words import number_of
 
 from .c3d import read_c3d, write_c3d
@@ -190,6 +190,45 @@ def read_marker_points(path: str | Path, unit: str | None = None, rate: float | 
     metres_of(unit)
     raw = _read_raw(path)
     return _in_metres(path, raw, range(len(raw.labels)), raw.labels, unit, rate, None, list(raw.notes))
+
+
+def resolve_marker_unit(places: Iterable[Path], unit: str | None) -> str | None:
+    """Return a unit as it is, and for "unknown" that in which the first recording's markers are as far apart as a body.
+
+    Parameters
+    ----------
+    places : iterable of Path
+        Recordings, or folders of them.
+    unit : str, optional
+        As of `read_markers`, or "unknown".
+
+    Raises
+    ------
+    MarkerFileError
+        Markers that are as far apart as on a person in no unit.
+    """
+    if unit != UNKNOWN:
+        return unit
+    files = (path for place in places for path in ([place] if place.is_file() else sorted(place.rglob("*")))
+             if path.suffix.lower() in READERS)
+    path = next(files, None)
+    if path is None:
+        raise MarkerFileError(f"{', '.join(map(str, places))}: expected recordings of markers, found none")
+    raw = _read_raw(path)
+    # of several people the one with most markers; the median over frames, as a ghost stretches the box of its frame
+    whose = Counter(label.rpartition(":")[0] for label in raw.labels).most_common(1)[0][0]
+    columns = [i for i, label in enumerate(raw.labels) if label.rpartition(":")[0] == whose]
+    places_seen = np.where((raw.positions == 0).all(axis=2, keepdims=True), np.nan, raw.positions)[:, columns]
+    frames = [frame[known] for frame in places_seen[::max(1, len(places_seen) // 200)]
+              if (known := np.isfinite(frame).all(axis=1)).any()]
+    span = float(np.median([np.ptp(frame, axis=0).max() for frame in frames])) if frames else 0.0
+    likely = "m" if 0.8 <= span <= 2.3 else guess_unit(span)          # from somebody who crouches to stretched arms
+    if likely is None:
+        raise MarkerFileError(f"{path}: its markers span {span:.3g}, which is a person's size in no unit of "
+                              f"{', '.join(UNITS)}; say unit=")
+    warnings.warn(f"{path}: read with unit='{likely}', in which the markers span {span * UNITS[likely]:.2f} m",
+                  stacklevel=2)
+    return likely
 
 
 def _in_metres(path: Path, raw: RawMarkers, columns: Sequence[int], labels: tuple[str, ...], unit: str | None,

@@ -10,7 +10,6 @@ from model.body import BodyModel
 from model.files import load_model
 from scanprep.arguments import UsageError
 from scanprep.batch.calls import KeptCall
-from scanprep.cli import Unit
 
 from ...cli import read_model
 from .mosh import MoshConfig
@@ -39,7 +38,7 @@ class MoshCall(KeptCall):
     subjects: str = "auto"
     hold_out: tuple[str, ...] = ()
     retarget_to: Path | None = None
-    unit: Unit | None = None
+    unit: str | None = None
     rate: float | None = None
     unlabelled: bool = False
     config: MoshConfig = field(default_factory=MoshConfig)

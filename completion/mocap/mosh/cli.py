@@ -14,11 +14,12 @@ import numpy as np
 from scanprep.arguments import Alias, Called, Place, UsageError
 from scanprep.batch.pool import Progress, Workers
 from scanprep.batch.workspace import Results, Task, Workspace
-from scanprep.cli import Output, Unit
+from scanprep.cli import Output, PersonUnit
 from scanprep.console import JUDGEMENT, Metric, Outcome, bar, details, judgement_of, say
 from scanprep.folders import FolderCommand, as_line, figure
 from scanprep.ranges import Positive
 
+from ..files.markers import resolve_marker_unit
 from ..marker_sets.named import choose_layout
 from .call import MoshCall
 from .mosh import MoshConfig
@@ -31,7 +32,7 @@ Models = Annotated[tuple[Path, ...], Alias("-m", each=True)]
 
 def mosh_markers(markers: MarkersArg, output: Output, model: Models = (), layout: str | None = None,
                  subject_prefix: Annotated[str, Called("--subjects")] = "auto", hold_out: tuple[str, ...] = (),
-                 retarget_to: Annotated[Path | None, Called("--character")] = None, unit: Unit | None = None,
+                 retarget_to: Annotated[Path | None, Called("--character")] = None, unit: PersonUnit | None = None,
                  rate: Positive | None = None, unlabelled: bool = False,
                  config: MoshConfig = MoshConfig(),
                  workers: Workers = Workers(), *, space: Workspace) -> Outcome:
@@ -69,7 +70,7 @@ def mosh_markers(markers: MarkersArg, output: Output, model: Models = (), layout
             colon of the labels, as Ann; several, as Head,Trunk, are of one person.
         hold_out: Labels of markers that no stage sees, which then tell how well the body predicts.
         retarget_to: Model whose mean is a character, which makes the motion too: character.glb.
-        unit: Unit of the markers, where the file cannot tell.
+        unit: Unit of the markers, where the file cannot tell; "unknown": that in which they span a person.
         rate: Frames a second, where a file does not say or says it wrongly.
         unlabelled: The markers have no names: they are labelled first, as by `scape label`; --layout says which are
             worn.
@@ -81,7 +82,8 @@ def mosh_markers(markers: MarkersArg, output: Output, model: Models = (), layout
     held = tuple(label for words in hold_out for label in words.split(",") if label)
     if unlabelled and layout is None:
         raise UsageError("--unlabelled: expected --layout: which markers are worn, of scape layout list")
-    call = MoshCall(markers, model, layout, subject_prefix, held, retarget_to, unit, rate, unlabelled, config)
+    units = resolve_marker_unit(markers, unit)
+    call = MoshCall(markers, model, layout, subject_prefix, held, retarget_to, units, rate, unlabelled, config)
     with bar("people") as people, bar("one of them") as inside:
         return carry_out(call, space, workers, f"scape mosh {' '.join(sys.argv[2:])}", people, inside)
 
