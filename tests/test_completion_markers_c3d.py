@@ -43,7 +43,7 @@ def test_c3d_units_millimetres_where_it_does_not_say(tmp_path, units, factor):
                                rtol=1e-6)
 
 
-def test_c3d_an_unresolve_unit_asks_for_one(tmp_path):
+def test_c3d_an_unknown_unit_asks_for_one(tmp_path):
     path = c3d_file(tmp_path / "a.c3d", "AB", np.ones((3, 2, 2)), ("furlong",))
     with pytest.raises(MarkerFileError, match=r"a\.c3d: expected a unit of m, mm, cm, in, found 'furlong'"):
         read_markers(path)

@@ -46,6 +46,7 @@ from scanprep.judgement import (
     ONE_OF,
     USUAL,
     Judgement,
+    WrongScaleError,
     carry_judgements,
     implausible_body,
     judge_many,
@@ -97,7 +98,6 @@ REGISTER = "prep register {}.ply --template template.ply -o out.ply --config qui
 NOTHING = {
     "a ball": (REGISTER.format("ball"), ["of the scan lies off the template", "a scan of something else"]),
     "ten points": (REGISTER.format("ten"), ["0% of the template has data", "a scan of something else"]),
-    "another unit": (REGISTER.format("large") + " --landmarks large.json --unit m", ["--unit", "times as large"]),
     "a ball to align": ("prep align ball_mesh.ply good.ply -o out.ply", ["a start far from the target"]),
     "another unit to align": ("prep align large.ply good.ply -o out.ply --unit m", ["--unit", "times as large"]),
 }
@@ -117,6 +117,16 @@ def test_a_command_says_that_its_result_means_nothing(place, capsys, case):
     if case == "ten points":                                        # there is nothing to converge to
         assert {"metric": "converged", "value": "False", "unit": ""} in told["metrics"]
         assert {"metric": "distance to the scan, RMS", "value": None, "unit": "mm"} in told["metrics"]
+
+
+def test_another_unit_is_refused_before_the_search(place, tmp_path, capsys):
+    assert main(f"{REGISTER.format('large')} --landmarks large.json --unit m".split()) == 1
+    said = capsys.readouterr().err
+    assert "large.ply: it is" in said and "times as large as the body: the wrong unit? (--unit)" in said
+    assert not Path("out.ply").exists()
+    work = CompletionTask(worm_with_prior().subject(None), "model.npz", MARKS, QUICK, "in")
+    with pytest.raises(WrongScaleError, match=r"the scan is .* times as large as the body: the wrong unit"):
+        complete_files(work, CompletionInputs((Path("half.ply"),)), TaskContext(tmp_path / "out"))
 
 
 @pytest.mark.parametrize("case", GOOD)
@@ -140,11 +150,10 @@ def test_a_scan_of_something_else_is_a_failure_of_a_set(place, capsys):
     assert "nan" not in Path("set/registration.csv").read_text() and "none" in Path("set/registration.csv").read_text()
 
 
-@pytest.mark.parametrize(("scan", "unit", "words"), [
-    ("half", None, None), ("ball", None, ["explains", "a scan of something else"]), ("half", "in", ["--unit"])])
-def test_completions(place, tmp_path, scan, unit, words):
+@pytest.mark.parametrize(("scan", "words"), [("half", None), ("ball", ["explains", "a scan of something else"])])
+def test_completions(place, tmp_path, scan, words):
     model = worm_with_prior()
-    work = CompletionTask(model.subject(None), "model.npz", MARKS, QUICK, unit)
+    work = CompletionTask(model.subject(None), "model.npz", MARKS, QUICK, None)
     rows = complete_files(work, CompletionInputs((Path(f"{scan}.ply"),)), TaskContext(tmp_path / "out"))
     check(rows, words)
     assert (tmp_path / "out" / "completed.ply").exists()
@@ -442,8 +451,9 @@ def test_many_results_are_as_good_as_the_worst_of_them():
 
 @pytest.mark.parametrize(("stature", "volume", "betas", "verdict", "word"), [
     (1.75, 75, 2.0, "good", ""), (1.50, 45, 4.0, "good", ""), (2.00, 140, 4.0, "good", ""),
-    (2.61, 290, 20.0, "failed", "scale"), (4.04, 1150, 46.0, "failed", "scale"), (0.93, 12, 6.0, "failed", "scale"),
-    (1.20, 25, 5.0, "check", "child"), (2.20, 120, 5.0, "check", "giant"), (1.75, 190, 5.0, "check", "second person"),
+    (2.61, 290, 20.0, "failed", "scale"), (4.04, 1150, 46.0, "failed", "scale"), (0.62, 6, 6.0, "failed", "scale"),
+    (0.93, 12, 6.0, "check", "child"), (1.20, 25, 5.0, "check", "child"), (2.20, 120, 5.0, "check", "giant"),
+    (1.75, 190, 5.0, "check", "second person"),
     (1.75, 30, 5.0, "check", "flattened"),
     (1.75, 400, 5.0, "failed", "several"), (1.75, 75, 9.0, "check", "standard deviations"),
     (1.75, 75, 6.5, "good", ""), (1.75, 75, 13.8, "failed", "scale")])

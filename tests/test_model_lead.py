@@ -60,7 +60,7 @@ def test_what_leaves_less_to_doubt_is_kept(body, scan, far):
     class TwoBodies:
         name, parts = "crabs", None
 
-        def __call__(self, scan, landmarks=None, model=None):
+        def __call__(self, scan, landmarks=None, model=None, up=None):
             asked.append(float(np.abs(scan.vertices).max()))
             middle = scan.vertices.mean(axis=0)
             right = near(scan)
@@ -85,7 +85,7 @@ def test_two_bodies_that_explain_a_scan_alike_are_both_kept(far):
         def __init__(self, *bodies):
             self.bodies = bodies
 
-        def __call__(self, scan, landmarks=None, model=None):
+        def __call__(self, scan, landmarks=None, model=None, up=None):
             middle = scan.vertices[:len(egg.vertices)].mean(axis=0)
             return [body + middle for body in self.bodies]
 

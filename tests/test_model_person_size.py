@@ -6,12 +6,12 @@ import pytest
 import trimesh
 
 from completion import complete
+from model.files import load_model
 from model.fitting.bodies import as_body
 from model.fitting.scale import find_size
 from model.fitting.scan import prepare_scan
 from model.fitting.search import find_bodies
 from model.fitting.settings import ScanFitConfig
-from model.files import load_model
 from scanprep import Mesh, write_mesh
 from scanprep.geometry import rotations
 from scanprep.judgement import WrongScaleError, check_unit

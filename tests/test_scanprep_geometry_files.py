@@ -1,4 +1,5 @@
 """Meshes and folders: what is written comes back, and others agree."""
+import itertools
 import struct
 import warnings
 
@@ -213,9 +214,14 @@ def test_units_become_metres(tmp_path, unit, factor, suffix):
     np.testing.assert_allclose(mesh.corners, TETRAHEDRON.corners, atol=1e-6)
 
 
-@pytest.mark.parametrize("stature", [1.4, 1.75, 2.2])
+def test_a_number_is_the_length_of_a_unit(tmp_path):
+    write_mesh(tmp_path / "feet.ply", TETRAHEDRON.with_vertices(TETRAHEDRON.vertices / 0.3048))
+    np.testing.assert_allclose(read_mesh(tmp_path / "feet.ply", unit="0.3048").corners, TETRAHEDRON.corners, atol=1e-6)
+
+
+@pytest.mark.parametrize(("unit", "stature"), [*itertools.product(["mm", "cm", "in"], [1.4, 1.75, 2.2]), ("mm", 0.45),
+                                               ("cm", 0.95)])
 @pytest.mark.parametrize("far", [0, 4e6])
-@pytest.mark.parametrize("unit", ["mm", "cm", "in"])
 def test_the_unit_in_which_it_is_a_person_is_taken(tmp_path, unit, far, stature):
     person = TETRAHEDRON.with_vertices(TETRAHEDRON.vertices * stature / 1.5 / UNITS[unit] + far)
     write_mesh(tmp_path / "person.ply", person)
@@ -245,7 +251,7 @@ def test_what_belongs_together_has_one_unit(tmp_path):
     np.testing.assert_allclose(np.ptp(bodies.vertices, axis=1).max(axis=1), [1.75, 1.1, 0.19])
 
 
-@pytest.mark.parametrize(("factor", "says"), [(500, "unit='mm'"), (65, "unit='cm'"), (16, "unit='in'"),
+@pytest.mark.parametrize(("factor", "says"), [(2000, "unit='mm'"), (200, "unit='cm'"), (16, "unit='in'"),
                                               (1e-3, "divided by 1000")])
 def test_a_giant_or_a_dwarf_of_no_certain_unit_warns_and_stays(tmp_path, factor, says):
     person = TETRAHEDRON.with_vertices(TETRAHEDRON.vertices * factor * 1.75 / 1.5)
@@ -256,9 +262,9 @@ def test_a_giant_or_a_dwarf_of_no_certain_unit_warns_and_stays(tmp_path, factor,
     np.testing.assert_array_equal(mesh.vertices, person.vertices)
 
 
-def test_an_unresolve_unit_is_refused(tmp_path):
+def test_an_unknown_unit_is_refused(tmp_path):
     write_mesh(tmp_path / "a.ply", TETRAHEDRON)
-    with pytest.raises(ValueError, match=r"unit: expected one of m, mm, cm, in, got 'feet'"):
+    with pytest.raises(ValueError, match=r"unit: expected one of m, mm, cm, in, or its length in metres, got 'feet'"):
         read_mesh(tmp_path / "a.ply", unit="feet")
 
 

@@ -212,5 +212,5 @@ def test_the_command_takes_one_scan_in_any_unit(crab_files, tmp_path):
 def test_where_all_scans_fail_nothing_is_written(crab_files, tmp_path, capsys):
     write_mesh(tmp_path / "scan.ply", crab_files.with_vertices(90 * crab_files.vertices))
     assert command(tmp_path, "--unit", "m") == 1
-    assert "times as large as the template: the wrong unit? (--unit)" in capsys.readouterr().err
+    assert "times as large as the body: the wrong unit? (--unit)" in capsys.readouterr().err
     assert not (tmp_path / "points").exists()

@@ -195,7 +195,7 @@ def test_a_scan_in_another_unit_is_refused_at_once(scans, template, tmp_path):
     with pytest.warns(UserWarning, match="when read as metres"):
         done = prepare(find_scans(scans), template, MARKS, tmp_path / "set", QUICK)
     assert done.registered.names == ("body2",)
-    assert "e+03 times as large as the template: the wrong unit?" in done.failures[0]
+    assert "e+03 times as large as the body: the wrong unit?" in done.failures[0]
     assert "body1.ply: it is 0.00" in done.failures[1]
 
 
@@ -228,7 +228,7 @@ def test_correspondences_lead_where_there_are_no_landmarks(scans, template, tmp_
 def test_a_model_leads_where_there_are_no_landmarks_or_few(scans, template, tmp_path, monkeypatch):
     """It is laid on the template once; asked for by name it also leads scans with few landmarks."""
     asked, lead = [], ModelLead("balls", np.zeros((642, 3), dtype=np.int64), np.ones((642, 3)) / 3, np.zeros(642))
-    monkeypatch.setattr(ModelLead, "__call__", lambda self, scan, landmarks=None, model=None: [scan.vertices])
+    monkeypatch.setattr(ModelLead, "__call__", lambda self, scan, landmarks=None, model=None, up=None: [scan.vertices])
     monkeypatch.setattr(preparing, "lead_of", lambda template, through, progress: asked.append(through) or lead)
     turned = template.with_vertices(template.vertices @ Rotation.from_rotvec([2.0, 0, 0]).as_matrix().T)
     write_mesh(scans / "body0.ply", turned)

@@ -34,7 +34,7 @@ def call(tmp_path, monkeypatch):
     write_mesh(tmp_path / "scans" / "beside.ply", Mesh(np.vstack([EGG.vertices, board]), faces))
     write_mesh(tmp_path / "template.ply", EGG)
     lead = ModelLead("eggs", np.zeros((642, 3), dtype=np.int64), np.ones((642, 3)) / 3, np.zeros(642))
-    monkeypatch.setattr(ModelLead, "__call__", lambda self, scan, landmarks=None, model=None: [EGG.vertices, BACK])
+    monkeypatch.setattr(ModelLead, "__call__", lambda self, scan, *ignored: [EGG.vertices, BACK])
     for module in (preparing, bootstrap):
         monkeypatch.setattr(module, "lead_of", lambda template, *args: lead)
     monkeypatch.setattr(one_scan, "take_clutter", lambda scan: (scan, 0.0))      # it stays, and leaves a doubt
