@@ -77,11 +77,13 @@ def test_limbs_are_rolled_otherwise_where_the_template_is_a_person(scans, templa
     small = PlausibilityIssue(1.0, "the person is 1.20 m tall: a child, or the wrong scale?")
     monkeypatch.setattr(one_scan, "limb_doubts", lambda body, parts, vertices: told)
     monkeypatch.setattr(one_scan, "find_exchanged_sides", lambda body, parts, vertices: None)
+    hidden = PlausibilityIssue(1.0, "hardly anything of the left hand was seen: its place is a guess")
+    monkeypatch.setattr(one_scan, "hidden_doubts", lambda parts, mesh, seen: (hidden,))
     monkeypatch.setattr(one_scan, "size_doubts", lambda body, parts, vertices: (small,))
     monkeypatch.setattr(one_scan, "with_soles", lambda body, scan, fit, parts: stood.append((fit.rolled, parts)) or fit)
     task = find_scans(scans)[0]
     found = one_scan.register_scan(task, template, MARKS, QUICK.scan, person).figures
-    assert found.rolled and found.doubts == (*told, small)
+    assert found.rolled and found.doubts == (*told, hidden, small)
     animal = one_scan.register_scan(task, template, MARKS, QUICK.scan).figures
     assert not animal.rolled and animal.doubts == ()
     assert given == [(who, len(MARKS), QUICK.scan.registration, None) for who in (person, None)]

@@ -1,4 +1,6 @@
 """How sure a registration is, from all its evidence together."""
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -48,3 +50,14 @@ def test_of_what_is_no_person_no_probability_is_told():
     assert np.isnan(review([FINE], {}, SIZE, FACES, None, None, 0.1)[0].right)
     assert review([FINE], {"a": "why"}, SIZE, FACES, None, {"a": ()}, 0.1)[0].right == 0
     assert judge(ScanFigures("a", "", np.nan, np.nan, 0.0, 0.0, 1.0, 0.0, np.nan, 0, False)).right == 0
+
+
+def test_one_view_of_a_person_is_as_usual_and_of_something_else_is_not():
+    """Among whole scans: a person's limbs are doubted one by one, a crab's unseen half as a whole."""
+    whole = [replace(FINE, name=f"whole{k}", seen=0.95) for k in range(3)]
+    figures = [*whole, replace(FINE, name="view", seen=0.34)]
+    verdicts = {v.name: v for v in review(figures, {}, SIZE, FACES, doubts={})}
+    assert not any(verdict.suspect for verdict in verdicts.values())
+    assert review([*whole, replace(FINE, name="feet", seen=0.1)], {}, SIZE, FACES, doubts={})[0].name == "feet"
+    crab = review(figures, {}, SIZE, FACES)[0]
+    assert crab.name == "view" and crab.reasons[0].startswith("66% without data, 5% is usual")

@@ -8,7 +8,7 @@ from scanprep.judgement import size
 from scanprep.pipeline.scan import size_doubts
 from scanprep.registration import unmarked
 from scanprep.registration.limb_ends import RigidFit, bending, find_ends, rotate_ends
-from scanprep.registration.limbs import frames, limb_doubts, part_angles, part_bending, rolls
+from scanprep.registration.limbs import frames, hidden_doubts, limb_doubts, part_angles, part_bending, rolls
 from scanprep.registration.nonrigid import Registration
 from scanprep.registration.person import PersonParts, average_person
 from scanprep.skeleton.tree import Skeleton
@@ -138,3 +138,15 @@ def test_a_set_says_of_a_scan_that_it_has_the_size_of_no_adult(person, parts, sc
     found = size_doubts(person.mesh, parts, scale * person.mesh.vertices)
     assert [doubt.excess for doubt in found] == ([] if excess is None else [excess])
     assert all(word in doubt.words for doubt in found)
+
+
+def test_limbs_that_no_view_shows_are_named(person, parts):
+    """From the front every limb shows its half; a hand behind the back, and legs behind a table, show nothing."""
+    front = person.mesh.vertex_normals[:, 1] < 0
+    assert not hidden_doubts(parts, person.mesh, front)
+    behind = person.part_of_vertex == PARTS.index("hand_left")
+    words = [doubt.words for doubt in hidden_doubts(parts, person.mesh, front & ~behind)]
+    assert words == ["hardly anything of the left hand was seen: its place is a guess"]
+    legs = [f"{part}_{side}" for side in ("left", "right") for part in ("shin", "foot")]
+    below = np.isin(person.part_of_vertex, [PARTS.index(name) for name in legs])
+    assert len(hidden_doubts(parts, person.mesh, ~below)) == len(legs)

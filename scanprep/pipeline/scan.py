@@ -20,7 +20,7 @@ from ..ranges import FLAG, Settings
 from ..registration.figures import ScanFigures, figures_of
 from ..registration.ground import with_soles
 from ..registration.lead import Lead
-from ..registration.limbs import PlausibilityIssue, find_exchanged_sides, limb_doubts
+from ..registration.limbs import PlausibilityIssue, find_exchanged_sides, hidden_doubts, limb_doubts
 from ..registration.nonrigid import LedRegistration, register, registration_problem
 from ..registration.person import PersonParts, stature
 from ..registration.repair import repair_limbs
@@ -134,6 +134,7 @@ def finish_scan(name: str, template: Mesh, scan: Mesh | np.ndarray, led: LedRegi
 
         picture, scene = pictures_of(template, scan, fit)
     doubts = () if parts is None else (*limb_doubts(template, parts, fit.mesh.vertices),
+                                       *hidden_doubts(parts, fit.mesh, fit.seen),
                                        *size_doubts(template, parts, fit.mesh.vertices))
     figures = replace(figures_of(name, led.way, template, fit), removed=removed, doubts=doubts)
     rival = None if led.rival is None else finish_scan(name, template, scan, led.rival, parts, removed, pictures)

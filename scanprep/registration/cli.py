@@ -29,10 +29,10 @@ from ..geometry.landmarks import (
 )
 from ..geometry.mesh import Mesh
 from ..judgement import Judgement, check_unit, implausible_body, size
-from .figures import UNSEEN, figures_of, review
+from .figures import ONE_VIEW, UNSEEN, figures_of, review
 from .ground import soles_row, with_soles
 from .lead import lead_of
-from .limbs import find_exchanged_sides, limb_doubts
+from .limbs import find_exchanged_sides, hidden_doubts, limb_doubts
 from .nonrigid import LedRegistration, Registration, register, registration_problem
 from .person import PersonParts, person_parts, stature
 from .repair import repair_limbs
@@ -202,9 +202,11 @@ def judge_registration(name: str, template: Mesh, scan: Mesh | np.ndarray, fit: 
     # first what makes the registration meaningless, then what only needs a look
     problem = registration_problem(template, scan, fit, pairs is not None) or (
         find_exchanged_sides(template, parts, fit.mesh.vertices) if parts else None)
-    doubts = limb_doubts(template, parts, fit.mesh.vertices) if parts else ()
+    doubts = (*limb_doubts(template, parts, fit.mesh.vertices), *hidden_doubts(parts, fit.mesh, fit.seen)) \
+        if parts else ()
     verdict = review([figures_of(name, "", template, fit)], {} if problem is None else {name: problem}, size(template),
-                     len(template.faces), doubts={name: doubts} if parts else None, usual=UNSEEN)[0]
+                     len(template.faces), doubts={name: doubts} if parts else None,
+                     usual=ONE_VIEW if parts else UNSEEN)[0]
     rival = Judgement.of(check=[f"{RIVAL}: click some landmarks, left and right, to decide"] if has_rival else [])
     if parts is None or problem is not None:
         return verdict.judgement.merge(rival)

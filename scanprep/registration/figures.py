@@ -16,7 +16,8 @@ from ..words import number_of
 from .limbs import PlausibilityIssue
 from .nonrigid import Registration, share_stretched
 
-UNSEEN = 0.15                  # share of vertices that four views of a person leave without data
+# share of the surface of a person that four views leave without data, and that one view leaves, 0.54 to 0.68
+UNSEEN, ONE_VIEW = 0.15, 0.65
 NONE = "none"                  # what a table says where a figure has no value
 # Weights of a logistic model on the logarithms of the evidence; `certain` is the log-odds without any evidence.
 # Fitted by `fit_weights` of tests/benchmarks/reliability.py on 72 scans. Fitted on one half and tested on the other,
@@ -203,12 +204,13 @@ def review(figures: Sequence[ScanFigures], failures: Mapping[str, str], size: fl
     """Judge all scans, worst first.
 
     `size` is that of the template in metres, `faces` the number of its triangles. `doubts` lists per scan what no
-    person can do. `usual` is the share of vertices that scanners leave without data, by default the median of these
-    scans.
+    person can do. `usual` is the share of the surface that scanners leave without data, by default the median of these
+    scans. One view of a person is as usual: what it does not show of limbs is among the doubts.
     """
     limits = limits or Limits()
     if usual is None:
         usual = float(np.median([1 - f.seen for f in figures])) if figures else 0.0
+        usual = usual if doubts is None else max(usual, ONE_VIEW)
     # scans that failed come first, then the others by how far they are over a limit
     known = {f.name: f for f in figures}
     verdicts = [Verdict(name, np.inf, (reason,), known.get(name)) for name, reason in sorted(failures.items())]
@@ -260,7 +262,7 @@ def _judge(f: ScanFigures, size: float, faces: int, usual: float, limits: Limits
         f"{100 * f.missed:.1f}% of the scan lies off the template: "
         + ("a second person, or clutter?" if f.missed > 0.3 else "an uncovered limb, or clutter"): evidence["missed"],
         f"{1000 * f.distance:.1f} mm from the scan on average": evidence["distance"],
-        f"{100 * (1 - f.seen):.0f}% without data, {100 * usual:.0f}% is usual here: a part of the body, or one view?":
+        f"{100 * (1 - f.seen):.0f}% without data, {100 * usual:.0f}% is usual: a part of the body, or one view?":
             evidence["unseen"],
         f"{100 * f.stretch:.1f}% of the surface stretched or shrunk to the double or half": evidence["stretch"],
         f"{number_of(f.inverted, 'triangle')} inverted": evidence["inverted"],

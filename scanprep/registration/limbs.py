@@ -34,6 +34,8 @@ SLACK = {"pelvis": (0, 0, 0), "abdomen": (20, 42, 20), "chest": (20, 24, 20), "h
 # to 0.0025 more. Registered ones are smoother, and a larger allowance would miss a head twisted by 45 degrees.
 SHAPE = {"pelvis": 0.01, "abdomen": 0.01, "chest": 0.01, "head": 0.006, "upper_arm": 0.008, "forearm": 0.008,
          "hand": 0.008, "thigh": 0.012, "shin": 0.008, "foot": 0.008}
+# Parts that can be elsewhere though their neighbours are seen, and the share of one below which that is told.
+ENDS, HIDDEN = ("head", "forearm", "hand", "shin", "foot"), 0.05
 LIMBS = range(3, len(PARTS))           # head, arms and legs; the trunk depends on the build
 SCALE = 0.18                           # log-scale that one limb may differ from the whole body, 20%
 GRAVE = 30                             # degrees beyond the limit that double the severity
@@ -106,6 +108,16 @@ class LimbMeasures:
 def limb_doubts(template: Mesh, parts: PersonParts, vertices: np.ndarray) -> tuple[PlausibilityIssue, ...]:
     """List what no person can do in a registration, vertices (N, 3), metres, worst first."""
     return limb_measures(template, parts, vertices).doubts(parts.skeleton)
+
+
+def hidden_doubts(parts: PersonParts, mesh: Mesh, seen: np.ndarray) -> tuple[PlausibilityIssue, ...]:
+    """List limbs of a registered mesh whose place is a guess: `seen` (N,) bool hardly marks any vertex with data."""
+    skeleton, shown = parts.skeleton, seen[mesh.faces].mean(axis=1)
+    share = np.bincount(skeleton.part_of_face, mesh.face_areas * shown) / np.bincount(
+        skeleton.part_of_face, mesh.face_areas)
+    return tuple(PlausibilityIssue(1.0, f"hardly anything of the {in_words(name)} was seen: its place is a guess")
+                 for name, of_part in zip(skeleton.names, share, strict=True)
+                 if part_kind(name) in ENDS and of_part < HIDDEN)
 
 
 def find_exchanged_sides(template: Mesh, parts: PersonParts, vertices: np.ndarray) -> str | None:
