@@ -1,6 +1,7 @@
 """What the commands of this package share."""
 from __future__ import annotations
 
+import warnings
 from pathlib import Path
 from typing import Annotated
 
@@ -9,7 +10,6 @@ import numpy as np
 from model.body import BodyModel
 from model.linear import Subject
 from scanprep.arguments import Alias, Called
-from scanprep.console import say
 
 ModelOrNone = Annotated[Path | None, Alias("-m")]
 Out = Annotated[Path, Alias("-o"), Called("--output")]
@@ -20,7 +20,8 @@ def read_model(path: Path | None) -> tuple[BodyModel, str]:
     from model.files import BUILT_IN, load_model
 
     if path is None:
-        say("note: no model named, so that of the built-in people is used: the shapes of soldiers (ANSUR II)")
+        warnings.warn("no model named, so that of the built-in people is used: the shapes of soldiers (ANSUR II)",
+                      stacklevel=2)
     return load_model(path or BUILT_IN), str(path or BUILT_IN)
 
 

@@ -21,7 +21,7 @@ from . import config_files, ranges
 from .arguments import Argument, UsageError, command_sentences, make_parser, near, read_line
 from .config_files import Flag
 from .console import JUDGEMENT, Metric, Outcome, keep_report, say, show, write_report
-from .interrupts import tidy_up
+from .interrupts import terminate_as_interrupt, tidy_up
 from .threads import one_thread
 from .words import OUR_MODULES
 
@@ -39,7 +39,7 @@ def run(function: Callable[..., Outcome], prog: str, argv: list[str]) -> int:
     All others write to a temporary folder, from which the finished output is moved to its place.
     """
     start, exit_code, call = time.perf_counter(), 2, None
-    with _notes(prog) as (spelled, notes), one_thread():
+    with _notes(prog) as (spelled, notes), one_thread(), terminate_as_interrupt():
         try:
             if (text := settings_file(function, argv)) is not None:
                 sys.stdout.write(text + "\n")
@@ -50,7 +50,7 @@ def run(function: Callable[..., Outcome], prog: str, argv: list[str]) -> int:
             tidy_up()
             outcome, report = call.carry_out(start, notes)
         except KeyboardInterrupt:
-            # Ctrl-C: say whether the same command resumes
+            # Ctrl-C or SIGTERM: say whether the same command resumes
             goes_on = call is not None and call.keeps_steps
             say(f"{prog}: interrupted; " + ("the same command goes on where it stopped" if goes_on else
                                             "nothing was written"))
@@ -285,6 +285,8 @@ def _notes(prog: str) -> Iterator[tuple[list[Callable[[str], str]], list[str]]]:
         text = " ".join(str(message).split())
         for spell in spelled:
             text = spell(text)
+        if text in notes:                    # a file that is read twice, or by several processes
+            return
         notes.append(text)
         say(f"{prog}: note: {text}")
 

@@ -8,6 +8,7 @@ import math
 import os
 import platform
 import sys
+import time
 import unicodedata
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
@@ -18,7 +19,7 @@ if TYPE_CHECKING:               # imported where used, so that help answers at o
     from .judgement import Judgement
 
 Progress = Callable[[int, int], None]
-
+LOG_EVERY = 60.0            # seconds between lines of progress in a log file: a night's work stays readable
 
 
 @dataclasses.dataclass(frozen=True)
@@ -81,11 +82,15 @@ def judgement_of(metrics: Iterable[Metric]) -> Judgement | None:
 def bar(what: str) -> Iterator[Progress]:
     """Show a progress bar on standard error, from its first call on; yield the callback that moves it.
 
-    Bars that are open at the same time are below each other.
+    Bars that are open at the same time are below each other. In a log file they are lines, one now and then.
     """
     from rich import progress
     from rich.console import Console
 
+    if not Console(stderr=True).is_terminal:
+        with _progress_lines(visible(what)) as report_progress:
+            yield report_progress
+        return
     with contextlib.ExitStack() as stack:
         if not _open_displays:
             columns = (progress.TextColumn("{task.description:<34}", markup=False), progress.BarColumn(),
@@ -101,6 +106,27 @@ def bar(what: str) -> Iterator[Progress]:
             shown.update(task, completed=done, total=total, visible=True)
 
         yield report_progress
+
+
+@contextlib.contextmanager
+def _progress_lines(what: str) -> Iterator[Progress]:
+    """Say how far the work is: when it begins, now and then, and when the block ends."""
+    line, begun, last = "", 0.0, 0.0
+
+    def report_progress(done: int, total: int) -> None:
+        nonlocal line, begun, last
+        now = time.monotonic()
+        begun = begun or now
+        line = f"{what}: {done} of {total} after {now - begun:.0f} s"
+        if not last or now - last > LOG_EVERY:
+            say(line)
+            line, last = "", now
+
+    try:
+        yield report_progress
+    finally:
+        if line:
+            say(line)
 
 
 _open_displays: list[Any] = []       # the display that bars share, while one is open

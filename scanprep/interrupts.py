@@ -1,9 +1,12 @@
-"""Ctrl-C while a command is still loading, which takes a second: end with one line, as later on."""
+"""Ctrl-C and SIGTERM end a command with one line, also while it is still loading, which takes a second."""
 from __future__ import annotations
 
+import contextlib
 import os
 import signal
 import sys
+import threading
+from collections.abc import Iterator
 
 
 def leave_if_command() -> None:
@@ -26,6 +29,23 @@ def tidy_up() -> None:
     """From here on Ctrl-C is an exception again, so that unfinished files are removed."""
     if signal.getsignal(signal.SIGINT) is _leave:
         signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
+@contextlib.contextmanager
+def terminate_as_interrupt() -> Iterator[None]:
+    """Make SIGTERM, as a cluster or a shutdown sends it, end the block as Ctrl-C does: with its processes and files."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+
+    def interrupt(number: int, frame: object) -> None:
+        raise KeyboardInterrupt
+
+    before = signal.signal(signal.SIGTERM, interrupt)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
 
 
 def _leave(_signal: int, _frame: object) -> None:

@@ -72,6 +72,16 @@ def test_every_kind_is_learned_and_read_again(folder, truth, tmp_path, kind):
     assert off < 0.02 * np.ptp(body, axis=0).max()
 
 
+@pytest.mark.parametrize("verdict", ["good", "check", "failed"])
+def test_what_was_said_about_the_scans_holds_for_the_model(folder, tmp_path, verdict):
+    reasons = [] if verdict == "good" else ["pose03: 8% of the scan lies off the template"]
+    (folder / "set" / "report.json").write_text(json.dumps({"judgement": {"verdict": verdict, "reasons": reasons}}))
+    outcome = learned(folder / "set", tmp_path / "m.npz", kind="skinning", skinning=SkinConfig(rounds=1, components=2))
+    (folder / "set" / "report.json").unlink()
+    assert any("pose03: 8% of the scan lies off" in why for why in outcome.judgement.reasons) == (verdict != "good")
+    assert outcome.judgement.verdict == verdict if verdict != "good" else outcome.judgement.verdict != "failed"
+
+
 def test_models_by_sex_stand_beside_the_neutral_one(folder, tmp_path):
     outcome = learned(folder / "set", tmp_path / "m.npz", folder / "set", by_sex=True, scape=QUICK)
     count = {name: load_model(tmp_path / f"m{name}.npz").info["shapes"] for name in ("", ".female", ".male")}

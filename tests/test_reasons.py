@@ -147,3 +147,28 @@ def test_what_reads_a_person_takes_a_unit_that_nobody_knows(command):
 @pytest.mark.parametrize("command", ["complete", "prep register", "prep run", "prep landmarks", "prep clean"])
 def test_what_looks_for_a_person_takes_the_axis_that_is_up(command):
     assert flags_of(command)["--up"] == {"x", "-x", "y", "-y", "z", "-z"}
+
+
+def next_steps():
+    """Yield place and expression of what commands print as `next:`."""
+    for path in sorted(each for package in ("scanprep", "model", "completion") for each in (ROOT / package).rglob("*.py")):
+        for call in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(call, ast.Call):
+                steps = [word.value for word in call.keywords if word.arg == "following"]
+                if getattr(call.func, "id", "") == "do_one":
+                    steps += call.args[-1:]
+                yield from ((path.relative_to(ROOT), step) for step in steps if not isinstance(step, ast.Name))
+
+
+STEPS = list(next_steps())
+
+
+@pytest.mark.parametrize("place, step", STEPS, ids=[f"{place}:{step.lineno}" for place, step in STEPS])
+def test_the_next_step_can_be_pasted_into_a_shell(place, step):
+    """Paths with blanks are quoted, and no placeholder such as MODEL.npz is named, which nobody has."""
+    assert len(STEPS) >= 10
+    for part in (part for part in ast.walk(step) if isinstance(part, ast.FormattedValue)):
+        parts = [part.value.body, part.value.orelse] if isinstance(part.value, ast.IfExp) else [part.value]
+        for value in parts:
+            assert isinstance(value, ast.JoinedStr | ast.Constant) or getattr(value.func, "id", "") == "quote", place
+    assert not re.search(r"\b[A-Z]{3,}\b", re.sub("BVH", "", text_of(step)))

@@ -1,6 +1,7 @@
 """The command `scape measure`."""
 from __future__ import annotations
 
+import warnings
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
@@ -20,7 +21,7 @@ from model.posing.transfer import own_body
 from model.shape_statistics import WORDS, Sex, shape_statistics
 from scanprep.arguments import Place, UsageError
 from scanprep.cli import MM, Output, PersonUnit
-from scanprep.console import Metric, Outcome, bar, say
+from scanprep.console import Metric, Outcome, bar
 from scanprep.geometry.files import write_mesh
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.storage import write_json
@@ -196,14 +197,14 @@ def _make_body(to: Sequence[str], output: Path, model: BodyModel, name: str, lan
     title = output.stem
     page = measures_page([title], [made.vertices], [measure(made.vertices, tapes, tapes.axes)], tapes, made.sex)
     likely_section(page, made).write(output.with_suffix(".html"))
-    say(f"note: the betas are in {betas.name}; scape complete --subject takes them")
+    warnings.warn(f"the betas are in {betas.name}; scape complete --subject takes them", stacklevel=2)
     # the table: what was asked for, how usual that is, and other common measurements
     rows = [_row(word, made.reached[word], made.sex, f", wanted {_number(word, value)}")
             for word, value in made.wanted.items()]
     if made.sex is not None and sex is None:
         rows.append(Metric("sex", f"{made.sex} ({100 * made.sex_probability:.0f}%)"))
-        say("note: nobody said the sex, so the more probable one is taken; name it with --sex, and the body and the "
-            "ranges are those of that sex")
+        warnings.warn("nobody said the sex, so the more probable one is taken; name it with --sex, and the body and "
+                      "the ranges are those of that sex", stacklevel=2)
     rows += [Metric("from the mean person", made.deviations, "sd"),
              Metric("people as far from the mean in these measurements", 100 * made.rarer, "%")]
     # other measurements in the closing table; page and report have all of them

@@ -1,6 +1,7 @@
 """The command `scape complete`."""
 from __future__ import annotations
 
+import warnings
 from dataclasses import replace
 from pathlib import Path
 from shlex import quote
@@ -10,7 +11,7 @@ from scanprep.arguments import Place, UsageError
 from scanprep.batch.pool import Workers
 from scanprep.batch.workspace import Task, Workspace
 from scanprep.cli import Output, PersonUnit, Unit
-from scanprep.console import Metric, Outcome, say
+from scanprep.console import Metric, Outcome
 from scanprep.folders import do_one, load_results
 from scanprep.geometry.landmarks import landmarks_beside
 from scanprep.judgement import judge_many
@@ -84,7 +85,8 @@ def complete_scan(scans: ScansArg = (), *, output: Output, model: ModelOrNone = 
     work = CompletionTask(body_of(loaded, subject, unit), name, marks, config, unit,
                           ColorConfig(fill=config.fill_colors))
     if inputs.landmarks is None:
-        say("note: no landmarks; the search starts from typical poses, look at report.html for limbs mixed up")
+        warnings.warn("no landmarks; the search starts from typical poses, look at report.html for limbs mixed up",
+                      stacklevel=2)
     return do_one("completing", space, work, Task("completion", inputs), {"complete": config, "model": name},
                   f"open {quote(str(output / 'report.html'))}, then scape measure {quote(str(output))} "
                   f"{'' if model is None else f'-m {quote(str(model))} '}-o measures.csv")

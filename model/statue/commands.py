@@ -5,6 +5,7 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from shlex import quote
 
 import numpy as np
 
@@ -86,8 +87,8 @@ def fit(scan: ScanArg, output: Output, features: Path | None = None, control: Pa
             raise UsageError("--control: expected --features with the joints of that control model; only the generic "
                              "humanoid is found by itself")
         return do_one("fitting the statue", space, work, Task("statue", ScanTask("statue", scan, features)),
-                      {"statue": config}, f"open {output / 'report.html'}, then "
-                                          f"scape statue animate {output} walk.bvh -o walking")
+                      {"statue": config}, f"open {quote(str(output / 'report.html'))}; a BVH file of yours moves it: "
+                      f"scape statue animate {quote(str(output))} walk.bvh -o walking")
     if features is not None and not features.is_dir():
         raise UsageError(f"--features: expected a folder for a folder of scans, got {features}")
     tasks = [Task(one.name, one if features else replace(one, landmarks=None), one.name)

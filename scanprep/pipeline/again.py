@@ -39,12 +39,12 @@ class Call(KeptCall):
         # the set keeps the template's landmarks even if no scan has any: models learned from it measure bodies by them
         landmarks = find_template_landmarks(self.template, template, self.template_landmarks)
         if through == "pose":
-            say("note: no landmarks are used; all scans must be near the template's pose")
+            say("no landmarks are used; all scans must be near the template's pose")
         elif len(without) == len(tasks):
-            say("note: no landmarks are used; look at the page for scans turned round or mirrored")
+            say("no landmarks are used; look at the page for scans turned round or mirrored")
         else:                                          # at least one scan has landmarks, so the template needs them
             landmarks = landmarks or read_template_landmarks(self.template, template, self.template_landmarks)
             if without:
-                say(f"note: no landmarks for {len(without)} of {len(tasks)} scans ({', '.join(without[:LISTED])}); "
+                say(f"no landmarks for {len(without)} of {len(tasks)} scans ({', '.join(without[:LISTED])}); "
                     "look at the page for those turned round or mirrored")
         return tasks, template, landmarks

@@ -1,9 +1,11 @@
 """`scape prep run` and `scape prep page`: register a whole folder of scans."""
 from __future__ import annotations
 
+import warnings
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from shlex import quote
 from typing import Annotated
@@ -54,7 +56,7 @@ def run_all(scans: ScansArg, template: Path, output: Output, landmarks: Path | N
         # an absolute path, as the set may be corrected from another folder later
         config = replace(config, scan=replace(config.scan, through=str(Path(config.scan.through).absolute())))
     call = Call(scans, template, landmarks, template_landmarks, subject, config)
-    inputs = call.inputs(say)
+    inputs = call.inputs(partial(warnings.warn, stacklevel=2))
     with bar("finding the parts of a person") as naming, bar("registering scans") as registering, \
             bar("finding the skeleton") as finding:
         return carry_out(call, inputs, space, registering, finding, naming)

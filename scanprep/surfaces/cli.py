@@ -1,6 +1,7 @@
 """From scans and range views to a clean mesh: `scape prep template`, `repair`, `views`, `merge`, `fill`, ..."""
 from __future__ import annotations
 
+import warnings
 from pathlib import Path
 from typing import Annotated
 
@@ -10,7 +11,7 @@ from ..alignment.views import AlignViewsConfig, align_views, views_doubts, views
 from ..arguments import Called, Place, UsageError
 from ..cleaning.clean_scan import CleanScanConfig, clean_scan, cleaning_doubts
 from ..cli import MM, MeshArg, Output, PersonUnit, ScanArg, Unit, about_mesh
-from ..console import Metric, Outcome, bar, say
+from ..console import Metric, Outcome, bar
 from ..dataset import RegisteredSet
 from ..decimation.decimate import DecimateConfig, decimate
 from ..decimation.registered_set import DecimateSetConfig, write_decimated_set
@@ -107,7 +108,7 @@ def template(scans: ScansArg, output: Output, faces: Faces = 14000, landmarks: P
     if marks:
         write_landmarks(output.with_name(f"{name_of(output)}.landmarks.json"), marks)
     for note in notes:
-        say(f"note: {note}")
+        warnings.warn(f"{output.name}: {note}", stacklevel=2)
     return Outcome(output, [*rows, Metric("landmarks carried", len(marks)), *about_mesh(made)],
                    judgement=_as_template(made).merge(Judgement.of(check=doubts)))
 
@@ -137,8 +138,8 @@ def _manifold(mesh: Mesh, path: Path) -> Mesh:
     if mesh.is_edge_manifold and mesh.is_vertex_manifold:
         return mesh
     mended = repair(mesh, 0.0)
-    say(f"note: {path} is not manifold; it is repaired first, as scape prep repair does: "
-        f"{len(mesh.faces) - len(mended.faces)} of {len(mesh.faces)} triangles go")
+    warnings.warn(f"{path} is not manifold; it is repaired first, as scape prep repair does: "
+                  f"{len(mesh.faces) - len(mended.faces)} of {len(mesh.faces)} triangles go", stacklevel=2)
     return mended
 
 

@@ -6,14 +6,13 @@ import contextlib
 import errno
 import os
 import shutil
-import signal
 import socket
 import tempfile
 import threading
 import time
 import traceback
 import webbrowser
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +22,7 @@ from tornado.netutil import bind_sockets
 from tornado.web import Application
 
 from .. import console
+from ..interrupts import terminate_as_interrupt
 from . import handlers
 from .app import App, Send
 from .gate import Gate, one_line
@@ -205,7 +205,7 @@ def serve(app: App, port: int | None = None, open_browser: bool = True, say: Cal
         Called with each line for the terminal.
     """
     remote = "SSH_CONNECTION" in os.environ
-    with contextlib.suppress(KeyboardInterrupt), _terminate_as_interrupt(), Server(app, port, say) as server:
+    with contextlib.suppress(KeyboardInterrupt), terminate_as_interrupt(), Server(app, port, say) as server:
         say(f"{one_line(app.title)}: {server.address}\nCtrl-C ends it")
         if remote or not open_browser:
             say(f"from another machine: ssh -N -L {server.port}:{ADDRESS}:{server.port} {socket.gethostname()}")
@@ -230,20 +230,3 @@ def _has_screen() -> bool:
     """Return whether a graphical browser can start here."""
     return os.name == "nt" or os.uname().sysname == "Darwin" or bool(
         os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
-
-
-@contextlib.contextmanager
-def _terminate_as_interrupt() -> Iterator[None]:
-    """Make SIGTERM end the block as Ctrl-C does."""
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-
-    def interrupt(number: int, frame: object) -> None:
-        raise KeyboardInterrupt
-
-    before = signal.signal(signal.SIGTERM, interrupt)
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGTERM, before)

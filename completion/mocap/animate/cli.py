@@ -2,6 +2,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from shlex import quote
 from typing import Annotated
 
 import numpy as np
@@ -103,7 +104,8 @@ def animate_markers(markers: MarkersArg, output: Output, model: ModelOrNone = No
     settings = {"animate": config, "person": person, "model": name}
     if markers.is_file():
         return do_one("following the markers", space, work, Task("motion", markers), settings,
-                      f"open {output / 'report.html'}; {output / 'animation.glb'} is for 3D programs")
+                      f"open {quote(str(output / 'report.html'))}; {quote(str(output / 'animation.glb'))} is for 3D "
+                      "programs")
     # the figure that ranks files: distance of markers, or of joint centres of another skeleton; 0 for a copied motion
     errors = MEAN_ERROR, MEAN_DISTANCE
     return FolderCommand(
