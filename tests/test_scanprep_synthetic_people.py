@@ -2,6 +2,7 @@
 from __future__ import annotations
 
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import igl
@@ -12,6 +13,7 @@ from scipy.stats import norm
 from model.measurement.find import find_tapes
 from model.measurement.measure import measure
 from model.measurement.survey import survey
+from model.measurement.tapes import Height
 from scanprep.geometry import rotations
 from scanprep.geometry.mesh import Mesh, template_problem
 from scanprep.registration.limbs import angle_excess, part_angles
@@ -71,12 +73,27 @@ def test_the_file_is_what_the_recipe_makes():
     assert population().source["recipe"] == recipe_digest(ROOT / "model" / "measurement" / "ansur2.json")
 
 
+def tapes_of_the_recipe():
+    """Tapes as they were when the people were made from the survey.
+
+    Heights were those on legs apart. Waist, bust and hips were the same rings of skin on everybody.
+    """
+    mesh, marks = topology.load_topology().mesh, landmarks()
+    tapes, low = (find_tapes(mesh, {name: v for name, v in marks.items() if left_out not in name})
+                  for left_out in ("navel", "neck"))            # the waist's own landmarks; nipples, not above them
+    waist = replace(tapes.found["waist_girth"], level=None)
+    rings = {"waist_girth": waist, "waist_height": Height(waist.centre),
+             "chest_girth": replace(low.found["chest_girth"], level=None),
+             "hip_girth": replace(tapes.found["hip_girth"], between=None)}
+    return replace(tapes, found={**tapes.found, **rings}, legs=())
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("sex", ["female", "male"])
 def test_people_of_a_sex_measure_as_those_of_the_survey(sex):
     """Means of measures, their spread and correlations, of 64 whose betas have exactly the moments of the sex."""
     people_, (mean, covariance), table = population(), population().moments[sex], survey(sex)
-    tapes = find_tapes(topology.load_topology().mesh, landmarks())
+    tapes = tapes_of_the_recipe()
     z = np.random.default_rng(3).standard_normal((32, len(mean)))
     z = np.vstack([z, -z]) @ np.linalg.inv(np.linalg.cholesky(z.T @ z / len(z))).T
     drawn = [people_.rows(b)[:len(people_.weights)] for b in mean + z @ np.linalg.cholesky(covariance).T]

@@ -4,6 +4,7 @@ from __future__ import annotations
 import contextlib
 import itertools
 from collections.abc import Callable, Iterator, Mapping
+from dataclasses import replace
 from functools import cached_property
 
 import numpy as np
@@ -12,8 +13,12 @@ from scanprep.geometry.geodesics import SurfaceGraph
 from scanprep.geometry.mesh import Mesh
 
 from .marks import BodyLandmarks, body_landmarks
-from .section import Carried, SectionCurve, direction, mean_of, section, tape
-from .tapes import Extent, Found, Girth, Height, Span, Straight, Tapes, Way, Weight
+from .section import Carried, SectionCurve, direction, mean_of, on_the_way, part_around, section, tape
+from .tapes import Extent, Found, Girth, Height, Leg, Span, Straight, Tapes, Way, Weight
+
+# Metres that a level lies above its landmarks, on a person of 1.75 m. The built-in people's vertex named navel is at the
+# lower rim of the navel, and those named nipples 2.5 cm to the inside and below, as MakeHuman's targets of both show.
+NAVEL, NIPPLES = 0.009, 0.008
 
 
 class _NotThereError(ValueError):
@@ -23,8 +28,8 @@ class _NotThereError(ValueError):
 def find_tapes(template: Mesh, landmarks: Mapping[str, int]) -> Tapes:
     """Find every measurement on a template that stands upright, its arms away from the body.
 
-    Waist, bust and ends of limbs are at landmarks. Hips and calves are the widest, neck and wrists the narrowest
-    sections between two landmarks.
+    Waist and bust are as high as navel and nipples, ends of limbs are at landmarks. Hips and calves are the widest, neck
+    and wrists the narrowest sections between two landmarks.
 
     Parameters
     ----------
@@ -61,7 +66,7 @@ def find_tapes(template: Mesh, landmarks: Mapping[str, int]) -> Tapes:
             missing[name] = f"the template has no landmark '{str(lacking)[1:-1]}'"
         except _NotThereError as problem:
             missing[name] = str(problem)
-    return Tapes(template, finder.places.axes, found, missing, finder.limbs)
+    return Tapes(template, finder.places.axes, found, missing, finder.limbs, finder.legs(found))
 
 
 class _Finder:
@@ -89,11 +94,11 @@ class _Finder:
         yield "head_girth", lambda: self.extreme("head_girth", 1, lambda t: self.level(
             p.at("top of head", "left ear", "right ear"), crown - (0.045 + 0.045 * t) * self.stature))
         yield "neck_girth", self.neck
-        yield "chest_girth", lambda: self.trunk("chest_girth", p.height("left nipple", "right nipple"))
-        yield "under_bust_girth", lambda: self.trunk(
-            "under_bust_girth", p.height("left nipple", "right nipple") - 0.085 * self.scale)
+        yield "chest_girth", lambda: self.trunk("chest_girth", self.above(NIPPLES, "left nipple", "right nipple"))
+        yield "under_bust_girth", lambda: self.keep("under_bust_girth", self.level(
+            self.middle(), p.height("left nipple", "right nipple") - 0.085 * self.scale), None, self.BAND, True)
         yield "waist_girth", self.waist
-        yield "waist_height", lambda: Height(self.girth("waist_girth").centre)
+        yield "waist_height", lambda: Height(self.girth("waist_girth").height)
         yield "hip_girth", self.hips
         yield "crotch_height", lambda: Height(self.point("crotch"))
         for side in ("left", "right"):
@@ -142,13 +147,21 @@ class _Finder:
             self.places.at(name)
         return mean_of(*(self.places.of[name] for name in names))
 
+    def above(self, rise: float, *names: str) -> Carried:
+        """Return the mean of landmarks, raised by metres of a person of 1.75 m: towards the neck, so it grows along."""
+        point, neck = self.point(*names), [name for name in ("neck front", "neck back") if name in self.places.of]
+        if not neck:
+            return point
+        top, up = self.point(*neck), self.places.up
+        share = rise * self.scale / float((top.at(self.mesh.vertices) - point.at(self.mesh.vertices)) @ up)
+        return on_the_way(point, top, share)
+
     def loop(self, origin: np.ndarray, normal: np.ndarray) -> SectionCurve:
-        """Find the closed section by a plane nearest to its point `origin` (3,), at most 12 cm away."""
-        curves = section(self.mesh.vertices, self.mesh.faces, origin, normal)
-        far = [np.linalg.norm(curve.at(self.mesh.vertices).mean(axis=0) - origin) for curve in curves]
-        if not curves or min(far) > 0.12 * self.scale:
+        """Find the closed section by a plane around its point `origin` (3,), else the nearest, at most 12 cm away."""
+        vertices = self.mesh.vertices
+        best = part_around(section(vertices, self.mesh.faces, origin, normal), vertices, origin, normal)
+        if best is None or np.linalg.norm(best.at(vertices).mean(axis=0) - origin) > 0.12 * self.scale:
             raise _NotThereError("the template has no section there")
-        best = curves[int(np.argmin(far))]
         if not best.closed:
             raise _NotThereError("a hole of the template crosses it")
         return best
@@ -163,8 +176,11 @@ class _Finder:
         return start + share * (end - start), (end - start) / np.linalg.norm(end - start)
 
     def keep(self, name: str, plane: tuple[np.ndarray, np.ndarray] | None, axis: tuple[Carried, Carried] | None,
-             band: float = 0.07, under_arms: bool = False) -> Girth:
-        """Store the girth in a plane (a point, its normal), or across the beginning of an axis, by its centroid."""
+             band: float = 0.07, under_arms: bool = False, level: Carried | None = None) -> Girth:
+        """Store the girth in a plane (a point, its normal), or across the beginning of an axis, by its centroid.
+
+        The plane keeps the `level` of a point, else that of the centroid.
+        """
         vertices = self.mesh.vertices
         if axis is None:
             assert plane is not None, "a girth without an axis has a plane"
@@ -180,7 +196,7 @@ class _Finder:
         if under_arms:
             near &= ~self.arms[self.mesh.faces].any(axis=1)
         aside = 1 if "upper_arm" in name else -1 if "thigh" in name else 0
-        self.done[name] = Girth(centre, axis, self.mesh.faces[near], ring, under_arms, aside)
+        self.done[name] = Girth(centre, axis, self.mesh.faces[near], ring, under_arms, aside, level)
         return self.done[name]
 
     @cached_property
@@ -218,32 +234,44 @@ class _Finder:
         hull = points[tape(points, normal)]
         return float(np.linalg.norm(hull - np.roll(hull, 1, axis=0), axis=1).sum())
 
-    def trunk(self, name: str, height: float) -> Girth:
-        """Find a level girth of the trunk."""
-        return self.keep(name, self.level(self.middle(), height), None, self.BAND, name != "waist_girth")
+    def trunk(self, name: str, height: Carried) -> Girth:
+        """Find a level girth of the trunk, as high as a point."""
+        plane = self.level(self.middle(), float(height.at(self.mesh.vertices) @ self.places.up))
+        return self.keep(name, plane, None, self.BAND, name != "waist_girth", height)
 
     def middle(self) -> np.ndarray:
         """Return a point (3,) on the axis of the trunk."""
         p = self.places
-        if "back" in p.of:
+        if {"navel", "back"} <= set(p.of):
             return p.at("navel", "back")
         return p.at("left hip", "right hip", "left shoulder", "right shoulder")
 
     def waist(self) -> Girth:
-        """Find the waist at its landmarks, else the narrowest section of the trunk."""
+        """Find the waist as high as the navel, else at its landmarks, else the narrowest section of the trunk."""
         p = self.places
+        if "navel" in p.of:
+            return self.trunk("waist_girth", self.above(NAVEL, "navel"))
         if {"left waist", "right waist"} <= set(p.of):
-            return self.trunk("waist_girth", p.height("left waist", "right waist"))
+            return self.trunk("waist_girth", self.point("left waist", "right waist"))
         low, high = p.height("crotch"), p.height("left nipple", "right nipple")
         return self.extreme("waist_girth", -1, lambda t: self.level(
             self.middle(), low + (0.35 + 0.5 * t) * (high - low)), None, self.BAND)
 
     def hips(self) -> Girth:
-        """Find the widest section from the crotch up to two thirds of the way to the waist."""
-        p = self.places
-        low, high = p.height("crotch"), p.height("left waist", "right waist", "navel")
-        return self.extreme("hip_girth", 1, lambda t: self.level(
-            self.middle(), low + (0.12 + 0.55 * t) * (high - low)), None, self.BAND)
+        """Find the widest section from the crotch up to two thirds of the way to the waist, anew on every body.
+
+        Among people it is up to 6 cm above or below the vertices that are in the widest section of the average.
+        """
+        low, waist = self.point("crotch"), [name for name in ("left waist", "right waist", "navel")
+                                            if name in self.places.of]
+        if not waist:
+            raise KeyError("navel")
+        high = self.point(*waist)
+        found = self.extreme("hip_girth", 1, lambda t: self.level(self.middle(), float(on_the_way(
+            low, high, 0.12 + 0.55 * t).at(self.mesh.vertices) @ self.places.up)), None, self.BAND + 0.06)
+        self.done["hip_girth"] = replace(found, between=(on_the_way(low, high, 0.02),
+                                                               on_the_way(low, high, 0.67)))
+        return self.done["hip_girth"]
 
     def neck(self) -> Girth:
         """Find the narrowest section across the neck, also among planes that sink towards the throat.
@@ -326,6 +354,25 @@ class _Finder:
             # triangles on paths up to 5 cm longer than the shortest: other bodies may take these
             faces.append(self.mesh.faces[(over[self.mesh.faces] <= over[start] + 0.05 * self.scale).any(axis=1)])
         return Way(tuple(vertices), tuple(faces), until)
+
+    def legs(self, found: Mapping[str, Found]) -> tuple[Leg, ...]:
+        """Return both legs as heights need them; none where one of them was not found."""
+        p, legs = self.places, list[Leg]()
+        for side, other in (("left", "right"), ("right", "left")):
+            foot, shin = found.get(f"foot_length_{side}"), self.limbs.get(f"{side} shin")
+            if not isinstance(foot, Extent) or shin is None or not {"left hip", "right hip"} <= set(p.of):
+                return ()
+            # joints of the hips are 0.58 times as far apart as the skin beside them, on the built-in people
+            hip = Carried(np.array([p.of[f"{side} hip"], p.of[f"{other} hip"]]), np.array([0.79, 0.21]))
+            top, knee, end = (centre.at(self.mesh.vertices) for centre in (hip, *shin))
+            way = float(np.linalg.norm(top - knee) + np.linalg.norm(knee - end))
+            ankle = self.floor + 0.04 * self.stature          # height of the joint, 7 cm
+            height = self.mesh.vertices[foot.vertices] @ p.up
+            sole = foot.vertices[height < height.min() + 0.012 * self.scale]
+            arch = float((self.mesh.vertices[sole] @ p.up).mean() - height.min())
+            legs.append(Leg((hip, *shin), sole, arch, float(np.linalg.norm(top - end)) / way,
+                            float(top @ p.up - ankle) / float((top - end) @ p.up)))
+        return tuple(legs)
 
     def foot(self, side: str) -> Extent:
         """Find the foot length, from heel to toes, of the low vertices on that side."""

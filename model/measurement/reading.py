@@ -1,6 +1,8 @@
 """One measurement of one body, with its derivative by every vertex."""
 from __future__ import annotations
 
+import itertools
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import singledispatch
 
@@ -9,8 +11,19 @@ import numpy as np
 from scanprep.geometry.mesh import Mesh
 
 from .path import shortest_path
-from .section import Carried, SectionCurve, bulge, chain_length, direction, section, tape, tape_length
-from .tapes import Extent, Found, Girth, Height, Span, Straight, Tapes, Way, Weight
+from .section import (
+    Carried,
+    SectionCurve,
+    bulge,
+    chain_length,
+    direction,
+    on_the_way,
+    part_around,
+    section,
+    tape,
+    tape_length,
+)
+from .tapes import Extent, Found, Girth, Height, Leg, Span, Straight, Tapes, Way, Weight
 
 # kilograms of a person per cubic metre inside the skin, and spread. Tissue has 1,030 to 1,080, depending on fat; lungs
 # half full hold 3 litres of air. The spread is that of fat (7% of the weight: 1.5%) and air (0.8 of 78 litres: 1%).
@@ -80,10 +93,11 @@ def _girth(found: Girth, body: Standing, tapes: Tapes) -> Reading:
 class _Cut:
     """The section of a girth: its plane, its points (m, 3), and those that the tape touches, in order (`hull`).
 
-    `change` (m, 3) is the derivative of the bulge at a point by its share along its edge.
+    `change` (m, 3) is the derivative of the bulge at a point by its share along its edge. `height` carries the plane.
     """
 
     curve: SectionCurve
+    height: Carried
     origin: np.ndarray
     normal: np.ndarray
     points: np.ndarray
@@ -92,38 +106,61 @@ class _Cut:
 
 
 def _plane(found: Girth, body: Standing) -> tuple[np.ndarray, np.ndarray]:
-    """Compute a point (3,) of the plane of a girth, and its normal."""
+    """Compute a point (3,) of the plane of a girth, on the axis of the part, and its normal."""
     normal = body.axes[0] if found.axis is None else direction(found.axis, body.vertices)
-    return found.centre.at(body.vertices), normal
+    centre = found.centre.at(body.vertices)
+    return centre + (found.height.at(body.vertices) - centre) @ normal * normal, normal
 
 
 def _cut_girth(found: Girth, body: Standing, tapes: Tapes) -> _Cut:
     """Cut the section of a girth by its carried plane; NotMeasuredError where it is not closed.
 
     Thigh and upper arm are measured as near to the trunk as they are separate. Their plane moves away in up to twelve
-    steps of 4 mm for a person of 1.75 m. Where arms are left out, the pieces of the section are joined.
+    steps of 4 mm for a person of 1.75 m. A girth between two levels is the longest of 13 sections there.
     """
-    vertices, (origin, normal) = body.vertices, _plane(found, body)
-    step = 0.004 * (np.ptp(vertices @ body.axes[0]) / 1.75) * found.aside * normal
-    for place in (origin + tried * step for tried in range(12 if found.aside else 1)):
-        curves = section(vertices, found.faces, place, normal)
-        if not curves:
-            raise NotMeasuredError("its plane meets nothing there")
-        # open curves that end at the border of the mesh mean a hole there; of the others the nearest counts
-        ends = np.concatenate([c.edges[[0, -1]] for c in curves if not c.closed] or [np.zeros((0, 2), int)])
-        if np.isin(ends, body.mesh.boundary_vertices).all(axis=1).any():
-            raise NotMeasuredError("a hole of the mesh crosses it")
-        far = [float(np.linalg.norm(c.at(vertices).mean(axis=0) - place)) for c in curves]
-        curve = curves[int(np.argmin(far))]
-        if found.under_arms and not curve.closed:
-            pieces = [c for c in curves if not c.closed]
-            curve = SectionCurve(np.concatenate([c.edges for c in pieces]), np.concatenate([c.share for c in pieces]),
-                                 True)
-        if curve.closed:
-            off, change = bulge(vertices, body.mesh.vertex_normals, curve)
-            points = curve.at(vertices) + off
-            return _Cut(curve, place, normal, points, change, tape(points, normal))
+    origin, normal = _plane(found, body)
+    if found.between is not None:
+        cuts = []
+        for share in np.linspace(0, 1, 13):
+            height = on_the_way(*found.between, float(share))
+            place = origin + (height.at(body.vertices) - origin) @ normal * normal
+            cuts.append(_cut_at(found, height, body, place, normal))
+        closed = [cut for cut in cuts if cut is not None]
+        if closed:
+            return max(closed, key=lambda cut: tape_length(cut.points[cut.hull], None)[0])
+    else:
+        step = 0.004 * (np.ptp(body.vertices @ body.axes[0]) / 1.75) * found.aside * normal
+        for place in (origin + tried * step for tried in range(12 if found.aside else 1)):
+            cut = _cut_at(found, found.height, body, place, normal)
+            if cut is not None:
+                return cut
     raise NotMeasuredError("its plane runs out of the part it goes around")
+
+
+def _cut_at(found: Girth, height: Carried, body: Standing, place: np.ndarray, normal: np.ndarray) -> _Cut | None:
+    """Cut the section of a girth by a plane through a point (3,); None where it runs out of the part.
+
+    NotMeasuredError where nothing is or a hole. Where arms are left out, the pieces of the section are joined.
+    """
+    vertices = body.vertices
+    curves = section(vertices, found.faces, place, normal)
+    curve = part_around(curves, vertices, place, normal)
+    if curve is None:
+        raise NotMeasuredError("its plane meets nothing there")
+    # open curves that end at the border of the mesh mean a hole there
+    ends = np.concatenate([c.edges[[0, -1]] for c in curves if not c.closed] or [np.zeros((0, 2), int)])
+    if np.isin(ends, body.mesh.boundary_vertices).all(axis=1).any():
+        raise NotMeasuredError("a hole of the mesh crosses it")
+    if found.under_arms and not curve.closed:
+        # front and back; a triangle of the arm that is left over is much shorter
+        lengths = [0.0 if c.closed else chain_length(c.at(vertices))[0] for c in curves]
+        pieces = [c for c, length in zip(curves, lengths, strict=True) if length > 0.2 * max(lengths)]
+        curve = SectionCurve(np.concatenate([c.edges for c in pieces]), np.concatenate([c.share for c in pieces]), True)
+    if not curve.closed:
+        return None
+    off, change = bulge(vertices, body.mesh.vertex_normals, curve)
+    points = curve.at(vertices) + off
+    return _Cut(curve, height, place, normal, points, change, tape(points, normal))
 
 
 def _section_derivative(found: Girth, cut: _Cut, chosen: np.ndarray, pull: np.ndarray, body: Standing
@@ -137,24 +174,24 @@ def _section_derivative(found: Girth, cut: _Cut, chosen: np.ndarray, pull: np.nd
     along = vertices[edges[:, 1]] - vertices[edges[:, 0]]
     out = np.einsum("md,md->m", pull, along + cut.change[chosen]) / (along @ cut.normal)
     on_edge = pull - out[:, None] * cut.normal
-    by_plane = _plane_pull(found, out, cut.points[chosen] - cut.origin, cut.normal, vertices)
+    by_plane = _plane_pull(cut.height, found.axis, out, cut.points[chosen] - cut.origin, cut.normal, vertices)
     return (np.concatenate([edges[:, 0], edges[:, 1], by_plane[0]]),
             np.concatenate([(1 - share)[:, None] * on_edge, share[:, None] * on_edge, by_plane[1]]), float(out.sum()))
 
 
-def _plane_pull(found: Girth, out: np.ndarray, apart: np.ndarray, normal: np.ndarray, vertices: np.ndarray
-                ) -> tuple[np.ndarray, np.ndarray]:
+def _plane_pull(height: Carried, axis: tuple[Carried, Carried] | None, out: np.ndarray, apart: np.ndarray,
+                normal: np.ndarray, vertices: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Compute the derivative by the vertices that carry the plane of a girth: vertices (k,), force (k, 3).
 
     `out` (m,) is the derivative by each point's shift along the normal; `apart` (m, 3) are the points relative to the
     plane's.
     """
-    ids, force = [found.centre.vertices], [found.centre.weights[:, None] * (out.sum() * normal)]
-    if found.axis is not None:                                            # the plane turns with the limb
-        length = np.linalg.norm(found.axis[1].at(vertices) - found.axis[0].at(vertices))
+    ids, force = [height.vertices], [height.weights[:, None] * (out.sum() * normal)]
+    if axis is not None:                                                  # the plane turns with the limb
+        length = np.linalg.norm(axis[1].at(vertices) - axis[0].at(vertices))
         by_normal = -(out @ apart)
         by_end = (by_normal - (by_normal @ normal) * normal) / length
-        for point, sign in zip(found.axis, (-1, 1), strict=True):
+        for point, sign in zip(axis, (-1, 1), strict=True):
             ids.append(point.vertices)
             force.append(sign * point.weights[:, None] * by_end)
     return np.concatenate(ids), np.concatenate(force)
@@ -179,13 +216,35 @@ def _through(middle: np.ndarray, points: np.ndarray, way: np.ndarray) -> np.ndar
 @read_measurement.register
 def _height(found: Height, body: Standing, tapes: Tapes) -> Reading:
     up, height = body.axes[0], body.vertices @ body.axes[0]
-    floor = int(height.argmin())
     top = Carried(np.array([height.argmax()]), np.ones(1)) if found.top is None else found.top
     place = top.at(body.vertices)
-    value = float(place @ up - height[floor])
-    force = np.concatenate([top.weights[:, None] * up, -up[None]])
-    return Reading(value, np.stack([place - value * up, place]), np.append(top.vertices, floor), force,
+    # a foot that is off the floor does not bear the body; soles differ by less than 3 cm where both do
+    floors = [float(height[leg.sole].mean()) - leg.arch for leg in tapes.legs]
+    bears = [floor < min(floors) + 0.03 for floor in floors]
+    legs, floors = list(itertools.compress(tapes.legs, bears)), list(itertools.compress(floors, bears))
+    soles = [leg.sole for leg in legs] or [np.array([height.argmin()])]
+    floor = float(np.mean(floors or height.min()))
+    longer, ids, force = _straighten(legs, body)
+    value = float(place @ up) - floor + longer
+    ids = np.concatenate([top.vertices, *soles, ids])
+    force = np.concatenate([top.weights[:, None] * up, *(
+        np.tile(-up / len(soles) / len(sole), (len(sole), 1)) for sole in soles), force])
+    return Reading(value, np.stack([place - (place @ up - floor) * up, place]), ids, force,
                    0.0 if found.top is None else float(np.linalg.norm(top.weights)))
+
+
+def _straighten(legs: Sequence[Leg], body: Standing) -> tuple[float, np.ndarray, np.ndarray]:
+    """Compute by how much a body is taller on straight, upright legs, metres; with the derivative (k, 3) by vertices."""
+    value, ids, force = 0.0, [np.zeros(0, dtype=np.int64)], [np.zeros((0, 3))]
+    for leg in legs:
+        for upper, lower in itertools.pairwise(leg.centres):
+            way = upper.at(body.vertices) - lower.at(body.vertices)
+            length, weight = float(np.linalg.norm(way)), leg.share / len(legs)
+            value += weight * (leg.straight * length - float(way @ body.axes[0]))
+            pull = weight * (leg.straight * way / length - body.axes[0])
+            ids += [upper.vertices, lower.vertices]
+            force += [upper.weights[:, None] * pull, -lower.weights[:, None] * pull]
+    return value, np.concatenate(ids), np.concatenate(force)
 
 
 @read_measurement.register
@@ -253,7 +312,8 @@ def _until(girth: Girth, way: SectionCurve, body: Standing) -> tuple[float, np.n
     ahead = points[0] - body.vertices[before]
     reach, rise, lack = float(np.linalg.norm(ahead)), ahead @ normal, (origin - points[0]) @ normal
     by_ahead = lack * (ahead / (reach * rise) - reach / rise**2 * normal)
-    ids, force = _plane_pull(girth, np.array([reach / rise]), (points[0] - origin)[None], normal, body.vertices)
+    ids, force = _plane_pull(girth.height, girth.axis, np.array([reach / rise]), (points[0] - origin)[None], normal,
+                             body.vertices)
     beyond = int(((points - origin) @ normal * np.sign(rise) < 0).argmax())      # so many points lie behind the plane
     if beyond:
         # the way crosses the plane: it ends there

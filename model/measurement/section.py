@@ -1,6 +1,7 @@
 """Plane sections of a surface, and the tape around them."""
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -21,6 +22,11 @@ class Carried:
 def mean_of(*vertices: int) -> Carried:
     """Return the mean of some vertices as a carried point."""
     return Carried(np.array(vertices), np.full(len(vertices), 1 / len(vertices)))
+
+
+def on_the_way(first: Carried, second: Carried, share: float) -> Carried:
+    """Return the point at a share of the way between two carried points."""
+    return Carried(np.r_[first.vertices, second.vertices], np.r_[(1 - share) * first.weights, share * second.weights])
 
 
 def direction(axis: tuple[Carried, Carried], body: np.ndarray) -> np.ndarray:
@@ -101,6 +107,32 @@ def _chains(links: np.ndarray) -> list[tuple[np.ndarray, bool]]:
             node = next((other for other in near[node] if other in left), -1)
         chains.append((np.array(chain), len(chain) > 2 and start in near[chain[-1]]))
     return chains
+
+
+def part_around(curves: Sequence[SectionCurve], body: np.ndarray, origin: np.ndarray, normal: np.ndarray
+                ) -> SectionCurve | None:
+    """Choose the curve that is the skin around a point (3,) of the plane, else the nearest; None of none.
+
+    Of closed curves one inside the other the outermost is the skin: a body with a mouth has a throat.
+    """
+    if not curves:
+        return None
+    across = np.linalg.svd(np.atleast_2d(normal))[2][1:]
+    points = [curve.at(body) for curve in curves]
+    nearest = int(np.argmin([np.linalg.norm(each.mean(axis=0) - origin) for each in points]))
+    # the skin goes around the point itself, or around the nearest curve
+    for centre in (origin, points[nearest].mean(axis=0)):
+        outer = [k for k, curve in enumerate(curves) if curve.closed and _winds((points[k] - centre) @ across.T)]
+        if outer:
+            return curves[max(outer, key=lambda k: float(np.ptp(points[k], axis=0).max()))]
+    return curves[nearest]
+
+
+def _winds(points: np.ndarray) -> bool:
+    """Return whether a closed polygon (m, 2) goes around the origin."""
+    x, y = points.T
+    turns = np.arctan2(x * np.roll(y, -1) - y * np.roll(x, -1), x * np.roll(x, -1) + y * np.roll(y, -1))
+    return abs(float(turns.sum())) > np.pi
 
 
 def tape(points: np.ndarray, normal: np.ndarray) -> np.ndarray:
