@@ -359,18 +359,21 @@ class _Finder:
         """Return both legs as heights need them; none where one of them was not found."""
         p, legs = self.places, list[Leg]()
         for side, other in (("left", "right"), ("right", "left")):
-            foot, shin = found.get(f"foot_length_{side}"), self.limbs.get(f"{side} shin")
-            if not isinstance(foot, Extent) or shin is None or not {"left hip", "right hip"} <= set(p.of):
+            foot, shin, twin = found.get(f"foot_length_{side}"), *(
+                self.limbs.get(f"{each} shin") for each in (side, other))
+            if not isinstance(foot, Extent) or shin is None or twin is None or not {"left hip", "right hip"} <= set(p.of):
                 return ()
-            # joints of the hips are 0.58 times as far apart as the skin beside them, on the built-in people
-            hip = Carried(np.array([p.of[f"{side} hip"], p.of[f"{other} hip"]]), np.array([0.79, 0.21]))
-            top, knee, end = (centre.at(self.mesh.vertices) for centre in (hip, *shin))
+            # On the built-in people joints of the hips are 0.58 times as far apart as the skin beside them, and the
+            # bones of the lower shins 0.95 times as far as the centres of their skin.
+            centres = (on_the_way(self.point(f"{side} hip"), self.point(f"{other} hip"), 0.21), shin[0],
+                       on_the_way(shin[1], twin[1], 0.025))
+            top, knee, end = (centre.at(self.mesh.vertices) for centre in centres)
             way = float(np.linalg.norm(top - knee) + np.linalg.norm(knee - end))
             ankle = self.floor + 0.04 * self.stature          # height of the joint, 7 cm
             height = self.mesh.vertices[foot.vertices] @ p.up
             sole = foot.vertices[height < height.min() + 0.012 * self.scale]
             arch = float((self.mesh.vertices[sole] @ p.up).mean() - height.min())
-            legs.append(Leg((hip, *shin), sole, arch, float(np.linalg.norm(top - end)) / way,
+            legs.append(Leg(centres, sole, arch, float(np.linalg.norm(top - end)) / way,
                             float(top @ p.up - ankle) / float((top - end) @ p.up)))
         return tuple(legs)
 

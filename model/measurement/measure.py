@@ -2,7 +2,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -12,8 +12,8 @@ from scanprep.geometry.mesh import Mesh
 from .reading import NotMeasuredError, Reading, Standing, read_measurement
 from .tapes import Tapes
 
-# chosen on half views of the ten even people of `tests/benchmarks/measures.py`; the odd ones test them
-MOST, SHARE = 0.010, 0.02            # metres, and share of the value: larger errors are of the pose, not of the shape
+REACH = 0.10                         # metres over which errors of the surface are correlated
+PLACE = 0.007                        # metres from where a section or landmark should be, along the part
 MANY = 2000                          # vertices: the matrix of their distances takes 100 megabytes with intermediates
 
 
@@ -32,8 +32,9 @@ class Measurements:
     axes : (3, 3) float
         Unit vectors up, left and ahead of the body.
     errors : dict of str to float
-        Expected error, root mean square, in the unit of the measurement. Only of the weight where no errors of the
-        vertices are given.
+        Expected error, root mean square, in the unit of the measurement.
+    body : (N, 3) float, metres
+        The vertices on which the curves lie.
 
     Examples
     --------
@@ -48,7 +49,8 @@ class Measurements:
     missing: Mapping[str, str]
     turned: tuple[str, ...]
     axes: np.ndarray
-    errors: Mapping[str, float] = field(default_factory=dict)
+    errors: Mapping[str, float]
+    body: np.ndarray
 
     @property
     def values(self) -> dict[str, float]:
@@ -73,7 +75,7 @@ def measure(body: Mesh | np.ndarray, tapes: Tapes, axes: np.ndarray | None = Non
     axes : (3, 3) float, optional
         Unit vectors up, left and ahead of the body; by default from aligning the template with it.
     expected_error : (N,) float, metres, optional
-        Expected errors of the vertices, for example of a `Completion`.
+        Expected errors of the vertices, for example of a `Completion`. Without it the surface counts as exact.
     only : iterable of str, optional
         Names of the catalogue; by default all.
 
@@ -107,9 +109,8 @@ def measure(body: Mesh | np.ndarray, tapes: Tapes, axes: np.ndarray | None = Non
             readings[name] = read_measurement(tapes.found[name], standing, tapes)
         except NotMeasuredError as problem:
             missing[name] = str(problem)
-    errors = {name: reading.unknown if expected_error is None else measurement_error(reading, vertices, expected_error)
-              for name, reading in readings.items() if expected_error is not None or reading.unknown}
-    return Measurements(readings, missing, find_turned_limbs(tapes, standing), axes, errors)
+    errors = {name: measurement_error(reading, vertices, expected_error) for name, reading in readings.items()}
+    return Measurements(readings, missing, find_turned_limbs(tapes, standing), axes, errors, vertices)
 
 
 def laid_on(template: Mesh, vertices: np.ndarray) -> np.ndarray:
@@ -145,7 +146,7 @@ def find_turned_limbs(tapes: Tapes, body: Standing, share: float = 1.0) -> tuple
     return tuple(texts)
 
 
-def measurement_error(reading: Reading, vertices: np.ndarray, expected: np.ndarray) -> float:
+def measurement_error(reading: Reading, vertices: np.ndarray, expected: np.ndarray | None) -> float:
     """Compute the expected error of a measurement, root mean square, in its unit.
 
     The derivative by the vertices is applied to errors that are isotropic and correlated over 10 cm. Errors by sliding
@@ -157,20 +158,21 @@ def measurement_error(reading: Reading, vertices: np.ndarray, expected: np.ndarr
         The measurement.
     vertices : (N, 3) float, metres
         The body that was measured.
-    expected : (N,) float, metres
-        Root mean square error of each vertex, as of a completion.
+    expected : (N,) float, metres, optional
+        Root mean square error of each vertex, as of a completion; none for an exact surface.
     """
-    most = MOST if reading.unknown else min(MOST, SHARE * reading.value)
-    pull = np.minimum(expected[reading.vertices], most)[:, None] * reading.force / np.sqrt(3)
+    surface = 0.0 if expected is None else surface_error(reading, vertices, expected)
+    return float(np.sqrt(surface**2 + (PLACE * reading.slope)**2 + reading.unknown**2))
+
+
+def surface_error(reading: Reading, vertices: np.ndarray, expected: np.ndarray) -> float:
+    """Compute the error of a measurement by that of the surface, see `measurement_error`."""
+    pull = expected[reading.vertices][:, None] * reading.force / np.sqrt(3)
     # with thousands of vertices, those in one cube of a quarter of the reach are summed: their errors are alike
-    reach = 0.10  # metres over which errors of the surface are correlated
-    cubes = vertices if len(np.unique(reading.vertices)) < MANY else np.floor(vertices / (0.25 * reach))
+    cubes = vertices if len(np.unique(reading.vertices)) < MANY else np.floor(vertices / (0.25 * REACH))
     first, place = np.unique(cubes[reading.vertices], axis=0, return_index=True, return_inverse=True)[1:]
-    place = place.ravel()
     sums = np.zeros((len(first), 3))
-    np.add.at(sums, place, pull)
+    np.add.at(sums, place.ravel(), pull)
     points = vertices[reading.vertices[first]]
-    together = np.exp(-0.5 * (np.linalg.norm(points[:, None] - points, axis=2) / reach)**2)
-    variance = np.einsum("id,ij,jd->", sums, together, sums)
-    # a section or landmark may be 3 mm from its right place along the part
-    return float(np.sqrt(max(variance, 0) + (0.003 * reading.slope)**2 + reading.unknown**2))
+    together = np.exp(-0.5 * (np.linalg.norm(points[:, None] - points, axis=2) / REACH)**2)
+    return float(np.sqrt(max(np.einsum("id,ij,jd->", sums, together, sums), 0)))

@@ -131,6 +131,15 @@ class SurfaceCarrier:
         corners = vertices[..., self._corners, :]
         return self._between(corners) + np.einsum("...nij,nj->...ni", _frames(corners), self._off)
 
+    def carry(self, riders: np.ndarray, ridden: np.ndarray, moved: np.ndarray) -> np.ndarray:
+        """Compute where riders (n, 3) on vertices `ridden` (N, 3) come to lie when these move to `moved` (N, 3).
+
+        Each rider keeps its triangle of the template, and its own distance from it.
+        """
+        before, after = ridden[self._corners], moved[self._corners]
+        off = np.einsum("nji,nj->ni", _frames(before), riders - self._between(before))
+        return self._between(after) + np.einsum("nij,nj->ni", _frames(after), off)
+
     def displacements(self, fields: np.ndarray) -> np.ndarray:
         """Interpolate small displacements (..., N, 3), metres, at the carried points: (..., n, 3)."""
         return self._between(fields[..., self._corners, :])
