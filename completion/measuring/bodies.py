@@ -1,7 +1,6 @@
 """Read bodies from files: registered, completed, or as betas of a model."""
 from __future__ import annotations
 
-import warnings
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -9,41 +8,35 @@ from pathlib import Path
 import numpy as np
 
 from model.body import BodyModel
-from model.measurement.marks import MEASURED
-from model.measurement.tapes import Tapes
-from model.people import stature_and_volume
 from model.posing.cli import read_subject
-from scanprep.console import bar
 from scanprep.dataset import RegisteredSet
 from scanprep.geometry.files import list_meshes, name_of, read_mesh
-from scanprep.geometry.landmark_names import translate_landmarks
-from scanprep.geometry.landmarks import landmarks_beside, read_landmark_vertices
 from scanprep.geometry.mesh import Mesh
-from scanprep.judgement import implausible_body
-from scanprep.registration.person import find_landmarks
 from scanprep.registration.unit import resolve_unit
-from scanprep.words import number_of
 
-from ..partial.completion import load_completion
+from ..partial.completion import Completion, load_completion
 from ..viewing.kinds import model_of_report
 
 # files by which the folders of commands are recognised
 COMPLETED, PERSON, MOTION = "completion.npz", "subject.json", "motion.npz"
+# Expected errors of the surface, metres: of registered meshes, of whose scans nothing is known here; of bodies made from
+# betas, as far from the person as the model's own error in `completion/partial/confidence.py`.
+REGISTERED, OF_BETAS = 0.002, 0.0075
 
 
 @dataclass(frozen=True, eq=False)
 class Body:
     """One body to measure.
 
-    `betas`: made from shape coefficients, so it stands as the model's template does. `path`: its origin, for landmarks
-    and messages. `expected_error`: (N,) metres, of a completed body.
+    `expected_error`: (N,) metres, of the vertices. `betas`: made from shape coefficients, so it stands as the model's
+    template does. `path`: its origin, for landmarks and messages.
     """
 
     name: str
     mesh: Mesh
     path: Path
+    expected_error: np.ndarray
     betas: bool = False
-    expected_error: np.ndarray | None = None
 
 
 def read_bodies(paths: Sequence[Path], model: BodyModel | None, unit: str | None) -> list[Body]:
@@ -86,10 +79,11 @@ def _bodies(path: Path, model: BodyModel | None, unit: str | None) -> Iterator[B
     elif (path / "set.json").exists():
         registered = RegisteredSet.load(path)
         for entry in registered.entries:
-            yield Body(entry.name, registered.template.with_vertices(registered.vertices([entry.name])[0]), path)
+            mesh = registered.template.with_vertices(registered.vertices([entry.name])[0])
+            yield Body(entry.name, mesh, path, everywhere(mesh, REGISTERED))
     elif (path / COMPLETED).exists():
         completion = load_completion(path)
-        yield Body(path.name, completion.completed, path, expected_error=completion.expected_error)
+        yield Body(path.name, completion.completed, path, completion_error(completion))
     elif (path / PERSON).exists() or (path / MOTION).exists():
         file = path / PERSON if (path / PERSON).exists() else path / MOTION
         yield _of_betas(path.name, file, model)
@@ -105,10 +99,26 @@ def _of_file(path: Path, model: BodyModel | None, unit: str | None) -> Body:
     """Read the body of a mesh, or of betas."""
     if path.suffix.lower() in (".json", ".npz"):
         return _of_betas(name_of(path), path, model)
-    error = None
+    mesh = read_mesh(path, resolve_unit(path, unit))
     if path.name == "completed.ply" and (path.parent / COMPLETED).exists():
-        error = load_completion(path.parent).expected_error
-    return Body(name_of(path), read_mesh(path, resolve_unit(path, unit)), path, expected_error=error)
+        return Body(name_of(path), mesh, path, completion_error(load_completion(path.parent)))
+    return Body(name_of(path), mesh, path, everywhere(mesh, REGISTERED))
+
+
+def completion_error(completion: Completion) -> np.ndarray:
+    """Return the expected errors (N,), metres, of a completed body.
+
+    They hold for people as the model knows them. Somebody whose betas are larger is as much less known.
+    """
+    if completion.expected_error is None:
+        return everywhere(completion.completed, REGISTERED)
+    size = 0.0 if completion.betas is None else float(np.sqrt(np.mean(completion.betas**2)))
+    return max(1.0, size) * completion.expected_error
+
+
+def everywhere(mesh: Mesh, error: float) -> np.ndarray:
+    """Return one expected error for all vertices of a mesh, (N,) metres."""
+    return np.full(len(mesh.vertices), error)
 
 
 def _of_betas(name: str, path: Path, model: BodyModel | None) -> Body:
@@ -116,63 +126,5 @@ def _of_betas(name: str, path: Path, model: BodyModel | None) -> Body:
     if model is None:
         raise ValueError(f"{path}: betas need their model; name it with -m")
     body = read_subject(model, path).vertices(np.zeros((len(model.skeleton.parents), 3)))
-    return Body(name, model.template.with_vertices(body), path, betas=True)
-
-
-def landmarks_of(file: Path | None, bodies: Sequence[Body], model: BodyModel | None) -> tuple[Mesh, dict[str, int]]:
-    """Return the template that tapes are defined on, and its landmarks.
-
-    The template is the model's, else that of the set, else the first body. Landmarks are from the given file, the
-    model, a file beside the bodies, or those of the built-in people if the triangles are theirs. Where tapes need more,
-    they are found by registering the average person.
-    """
-    from scanprep.synthetic.landmarks import landmarks
-    from scanprep.synthetic.topology import load_topology
-
-    # the template, and the landmarks that are known of it
-    body = bodies[0] if bodies else None
-    if model is not None:
-        template = model.template
-    else:
-        assert body is not None
-        template = RegisteredSet.load(body.path).template if (body.path / "set.json").exists() else body.mesh
-    beside = None if body is None else landmarks_beside(body.path) if not body.path.is_dir() else next(
-        (path for path in [body.path / "landmarks.json"] if path.exists()), None)
-    known = dict[str, int]()
-    if file is not None:
-        known = read_landmark_vertices(file, template)
-    elif model is not None and model.info.get("landmarks"):
-        known = dict(model.info["landmarks"])
-    elif beside is not None:
-        known = read_landmark_vertices(beside, template)
-    if not known and np.array_equal(template.faces, load_topology().mesh.faces):
-        known = landmarks()
-
-    # further landmarks that tapes need
-    missing = [name for name in MEASURED if name not in translate_landmarks(known)]
-    if not missing:
-        return template, known
-    with bar("looking for the other landmarks") as progress:
-        located = find_landmarks(template, known, progress)
-    more = {name: located[name] for name in missing if name in located}
-    if not more and not known:
-        size = implausible_body(*stature_and_volume(template)).reasons
-        raise ValueError("".join(f"{reason}; " for reason in size[:1]) + "measuring begins at landmarks of the "
-                         "template, and there are none, nor does the average person come to lie on it; name a file of "
-                         "them with --landmarks (scape pick makes one), or a model that keeps them with -m")
-    if more:
-        warnings.warn(f"{number_of(len(more), 'landmark was', 'landmarks were')} missing on the template and found "
-                      "with the average person, a few centimetres from where you would click; to place one yourself, "
-                      f"click it with scape pick under its name: {', '.join(more)}", stacklevel=2)
-    return template, known | more
-
-
-def check_standing(tapes: Tapes, body: Body) -> None:
-    """Raise ValueError for a template whose legs are bent, or whose arms are not below the shoulders."""
-    for name, (first, second) in tapes.limbs.items():
-        way = second.at(tapes.template.vertices) - first.at(tapes.template.vertices)
-        angle = float(np.degrees(np.arccos(-way @ tapes.axes[0] / np.linalg.norm(way))))
-        if angle > (25 if name.endswith("shin") else 75):           # degrees from vertical of a standing person
-            raise ValueError(f"{body.path}: it is the template of all bodies, as no model is named, and does not stand "
-                             f"upright: the {name} is {angle:.0f} degrees from it; name one that stands first, or the "
-                             "model with -m")
+    mesh = model.template.with_vertices(body)
+    return Body(name, mesh, path, everywhere(mesh, OF_BETAS), betas=True)

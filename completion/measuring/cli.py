@@ -9,15 +9,14 @@ from typing import Annotated
 import numpy as np
 
 from model.body import BodyModel
+from model.built_in import load_built_in_model
 from model.files import load_model
 from model.measurement.catalogue import CATALOGUE, plain
-from model.measurement.find import find_tapes
-from model.measurement.measure import Measurements, measure, stands
+from model.measurement.measure import Measurements, measure
+from model.measurement.person import measure_person
 from model.measurement.survey import ordinal, percentiles
-from model.measurement.tapes import Tapes
 from model.measurement.wanted import WantedBody, body_with_measurements, check_wanted
 from model.people import stature_and_volume
-from model.posing.transfer import own_body
 from model.shape_statistics import WORDS, Sex, shape_statistics
 from scanprep.arguments import Place, UsageError
 from scanprep.cli import MM, Output, PersonUnit
@@ -30,8 +29,9 @@ from scanprep.judgement import Judgement, implausible_body
 from scanprep.words import number_of
 
 from ..cli import ModelOrNone, read_model
-from .bodies import Body, check_standing, landmarks_of, model_of, read_bodies
+from .bodies import Body, model_of, read_bodies
 from .page import likely_section, measures_page
+from .template import TapedTemplate, tape_template
 
 BodiesArg = Annotated[tuple[Path, ...], Place("[BODY ...]")]
 
@@ -76,32 +76,29 @@ def measure_bodies(bodies: BodiesArg = (), *, output: Output, model: ModelOrNone
     named = model or model_of(bodies)
     loaded = None if named is None else load_model(named)
     read = read_bodies(bodies, loaded, unit)
-    tapes = find_tapes(*landmarks_of(landmarks, read, loaded))
-    if loaded is None:
-        check_standing(tapes, read[0])
-    measured, standing = _measure(read, loaded, tapes)
-    names = [body.name for body in read]
+    if loaded is None and np.array_equal(read[0].mesh.faces, load_built_in_model().template.faces):
+        loaded = load_built_in_model()
+    taped = tape_template(landmarks, read, loaded)
+    measured, tapes = measure_all(read, taped), taped.tapes
+    standing, names = [one.body for one in measured], [body.name for body in read]
     write_measures(output, names, measured, sex)
     measures_page(names, standing, measured, tapes, sex).write(output.with_suffix(".html"))
     return Outcome(output, _figures(names, measured, sex), {"model": None if named is None else str(named)},
                    judgement=judge_bodies(names, measured, [tapes.template.with_vertices(body) for body in standing]))
 
 
-def _measure(bodies: Sequence[Body], model: BodyModel | None, tapes: Tapes
-             ) -> tuple[list[Measurements], list[np.ndarray]]:
-    """Measure bodies; return measurements and the vertices (N, 3) as they were measured."""
-    measured, standing = list[Measurements](), list[np.ndarray]()
+def measure_all(bodies: Sequence[Body], template: TapedTemplate) -> list[Measurements]:
+    """Measure bodies; each with `Measurements.body` as it was measured."""
+    measured, tapes = list[Measurements](), template.tapes
     with bar("measuring") as progress:
         for number, body in enumerate(bodies):
-            vertices, axes = body.mesh.vertices, tapes.axes if body.betas else None
-            # a body in another pose is brought into the standard one, with all its detail
-            if not body.betas and model is not None and not stands(vertices, tapes):
-                rest = np.zeros((len(model.skeleton.parents), 3))
-                vertices, axes = own_body(model, vertices).subject.vertices(rest), tapes.axes
-            standing.append(vertices)
-            measured.append(measure(vertices, tapes, axes, body.expected_error))
+            vertices, error = body.mesh.vertices, body.expected_error
+            if body.betas or template.standing is None:
+                measured.append(measure(vertices, tapes, tapes.axes if body.betas else None, error))
+            else:
+                measured.append(measure_person(vertices, tapes, template.standing, tapes.axes, error))
             progress(number + 1, len(bodies))
-    return measured, standing
+    return measured
 
 
 def write_measures(path: Path, names: Sequence[str], measured: Sequence[Measurements], sex: Sex | None = None) -> None:
@@ -188,7 +185,7 @@ def _make_body(to: Sequence[str], output: Path, model: BodyModel, name: str, lan
     """Make the most probable body with given measurements: its mesh, betas and page."""
     wanted = check_wanted(read_measurements(to))
     shape_statistics(model, sex)              # raises at once for a sex that the model does not know
-    tapes = find_tapes(*landmarks_of(landmarks, [], model))
+    tapes = tape_template(landmarks, [], model).tapes
     made = body_with_measurements(model, tapes, wanted, sex)
     write_mesh(output, model.template.with_vertices(made.vertices))
     betas = output.with_name(f"{output.stem}.betas.json")

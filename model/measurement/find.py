@@ -385,4 +385,7 @@ class _Finder:
         low = self.mesh.vertices @ p.up - self.floor < 0.05 * self.scale
         near = np.linalg.norm(self.mesh.vertices - middle, axis=1) < 0.2 * self.scale
         own = (self.mesh.vertices - 0.5 * (p.at("left heel") + p.at("right heel"))) @ p.axes[1]
-        return Extent(np.flatnonzero(low & near & ((own > 0) == (side == "left"))), heel, toe)
+        vertices = np.flatnonzero(low & near & ((own > 0) == (side == "left")))
+        if not len(vertices):
+            raise _NotThereError("the template has no foot on that side of its landmarks")
+        return Extent(vertices, heel, toe)

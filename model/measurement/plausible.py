@@ -1,0 +1,65 @@
+"""Whether measurements are those of one person: shares of the stature, girths to each other, left to right."""
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from .catalogue import CATALOGUE, plain
+
+# Quotients of two measurements, least and largest. TODO
+QUOTIENTS: dict[tuple[str, str], tuple[float, float]] = {
+    ("neck_height", "stature"): (0.80, 0.90),
+    ("shoulder_height", "stature"): (0.76, 0.88),
+    ("waist_height", "stature"): (0.53, 0.67),
+    ("crotch_height", "stature"): (0.40, 0.54),
+    ("head_girth", "stature"): (0.28, 0.42),
+    ("arm_length", "stature"): (0.27, 0.40),
+    ("hand_length", "stature"): (0.08, 0.13),
+    ("foot_length", "stature"): (0.12, 0.18),
+    ("back_length", "stature"): (0.20, 0.32),
+    ("neck_girth", "head_girth"): (0.45, 0.95),
+    ("under_bust_girth", "chest_girth"): (0.75, 1.08),
+    ("waist_girth", "chest_girth"): (0.60, 1.25),
+    ("waist_girth", "hip_girth"): (0.58, 1.25),
+    ("chest_girth", "hip_girth"): (0.70, 1.35),
+    ("thigh_girth", "hip_girth"): (0.45, 0.75),
+    ("calf_girth", "thigh_girth"): (0.45, 0.85),
+    ("wrist_girth", "upper_arm_girth"): (0.30, 0.75)}
+SIDES = 0.12                         # of their mean, by which left and right differ at most
+
+
+def implausible_measures(values: Mapping[str, float]) -> list[str]:
+    """Find what no person measures so: a tape that lies elsewhere, or sides that were mixed up.
+
+    Parameters
+    ----------
+    values : dict of str to float
+        Metres, and kilograms of the weight, by names of the catalogue.
+
+    Returns
+    -------
+    list of str
+        A sentence for each quotient that is out of range, and for each pair of sides that differ.
+
+    Examples
+    --------
+    >>> implausible_measures({"stature": 1.75, "waist_height": 1.25, "waist_girth": 0.9, "hip_girth": 1.0})
+    ['waist height is 71% of stature, people have 53 to 67%: look at both tapes on the page']
+    """
+    reasons = []
+    for (name, other), (low, high) in QUOTIENTS.items():
+        for word in (name, f"{name}_left", f"{name}_right"):
+            whole = other if other in values else f"{other}{word.removeprefix(name)}"
+            share = values[word] / values[whole] if word in values and whole in values else low
+            if not low <= share <= high:
+                reasons.append(f"{_words(word)} is {100 * share:.0f}% of {_words(whole)}, people have "
+                               f"{100 * low:.0f} to {100 * high:.0f}%: look at both tapes on the page")
+    for left in (name for name in values if name.endswith("_left")):
+        right = f"{plain(left)}_right"
+        if right in values and abs(values[left] - values[right]) > SIDES * 0.5 * (values[left] + values[right]):
+            reasons.append(f"{_words(plain(left))} is {CATALOGUE[left].text(values[left])} left and "
+                           f"{CATALOGUE[left].text(values[right])} right: look at both tapes on the page")
+    return reasons
+
+
+def _words(name: str) -> str:
+    return name.replace("_", " ")
