@@ -20,6 +20,7 @@ from completion import MarkerLayout, MarkerSequence, write_markers
 from completion.__main__ import COMMANDS as SCAPE
 from completion.__main__ import main
 from completion.measuring import bodies
+from completion.measuring import template as measuring_template
 from completion.mocap.animate.work import AnimateTask as Follow
 from completion.mocap.pose.judgement import hardly_seen, judge_motions, motion_doubts, motion_problem
 from completion.mocap.pose.marked_body import AnimateConfig
@@ -513,12 +514,12 @@ def test_a_recording_whose_sides_are_all_exchanged_may_be_mirrored():
 
 
 def test_what_cannot_be_measured_for_its_size_is_told_so(monkeypatch):
-    monkeypatch.setattr(bodies, "find_landmarks", lambda *given: {})
+    monkeypatch.setattr(measuring_template, "lay_people", lambda mesh: None)
     ball = sphere(2, 1.0)
     for half, told in ((2.5, "wrong unit or scale"), (0.9, "^measuring begins")):
         slim = ball.with_vertices(half * ball.vertices * [0.15, 0.15, 1])
         with pytest.raises(ValueError, match=told):
-            bodies.landmarks_of(None, [bodies.Body("a", slim, Path("a.ply"))], None)
+            measuring_template.tape_template(None, [bodies.Body("a", slim, Path("a.ply"), np.zeros(0))], None)
 
 
 def test_a_reason_stays_one_when_it_is_read_again():

@@ -19,8 +19,8 @@ from ..viewing.kinds import model_of_report
 
 # files by which the folders of commands are recognised
 COMPLETED, PERSON, MOTION = "completion.npz", "subject.json", "motion.npz"
-# Expected errors of the surface, metres: of registered meshes, of whose scans nothing is known here; of bodies made from
-# betas, as far from the person as the model's own error in `completion/partial/confidence.py`.
+# Expected errors of the surface, metres: of registered meshes, of whose scans nothing is known here, and of bodies made
+# from betas, which are as far from the person as the model's own error in `completion/partial/confidence.py`.
 REGISTERED, OF_BETAS = 0.002, 0.0075
 
 
@@ -85,14 +85,14 @@ def _bodies(path: Path, model: BodyModel | None, unit: str | None) -> Iterator[B
         completion = load_completion(path)
         yield Body(path.name, completion.completed, path, completion_error(completion))
     elif (path / PERSON).exists() or (path / MOTION).exists():
-        file = path / PERSON if (path / PERSON).exists() else path / MOTION
-        yield _of_betas(path.name, file, model)
+        betas = path / PERSON if (path / PERSON).exists() else path / MOTION
+        yield _of_betas(path.name, betas, model)
     else:
         inner = sorted({p.parent for name in (COMPLETED, PERSON, MOTION) for p in path.glob(f"*/{name}")})
         for folder in inner:
             yield from _bodies(folder, model, unit)
-        for mesh in [] if inner else list_meshes(path):
-            yield _of_file(mesh, model, unit)
+        for file in [] if inner else list_meshes(path):
+            yield _of_file(file, model, unit)
 
 
 def _of_file(path: Path, model: BodyModel | None, unit: str | None) -> Body:

@@ -14,6 +14,7 @@ from model.files import load_model
 from model.measurement.catalogue import CATALOGUE, plain
 from model.measurement.measure import Measurements, measure
 from model.measurement.person import measure_person
+from model.measurement.plausible import implausible_measures
 from model.measurement.survey import ordinal, percentiles
 from model.measurement.wanted import WantedBody, body_with_measurements, check_wanted
 from model.people import stature_and_volume
@@ -53,10 +54,10 @@ def measure_bodies(bodies: BodiesArg = (), *, output: Output, model: ModelOrNone
         output: Table to write (.csv), in metres and kilograms, one line a body; beside it a page of the same name
             (.html) with the tapes on the bodies. With --to the mesh of the body; its betas are written beside it, for
             --subject.
-        model: Model of the bodies, else the one that their report names: who does not stand as its template does is
-            brought into that pose first. Without any the template is that of the set, else the first body.
+        model: Model of the bodies, else the one that their report names; everybody is brought into its pose first.
+            Without any the template is that of the set, else the first body, and the built-in people are laid on it.
         landmarks: Where the landmarks are on the template, else those that the model keeps, or of the file beside the
-            bodies.
+            bodies, or of the built-in people.
         unit: Unit of meshes; "unknown": it is found together with the person.
         to: Measurements that a body is to have, in metres, and its weight in kilograms, such as stature=1.80 weight=78;
             the rest is as probable as it can be, and told with its range. Needs a model, or takes the built-in one.
@@ -124,7 +125,7 @@ def write_measures(path: Path, names: Sequence[str], measured: Sequence[Measurem
 
 
 def judge_bodies(names: Sequence[str], all_measured: Sequence[Measurements], bodies: Sequence[Mesh]) -> Judgement:
-    """Judge whether bodies were measured properly: in the standard pose, completely, in the right unit."""
+    """Judge whether bodies were measured properly: in the standard pose, completely, as people are, in the unit."""
     absurd, doubts = list[str](), list[str]()
     for name, one, body in zip(names, all_measured, bodies, strict=True):
         if "stature" in one.values:
@@ -141,6 +142,7 @@ def judge_bodies(names: Sequence[str], all_measured: Sequence[Measurements], bod
             usual = CATALOGUE[out[0]]
             doubts.append(f"{name}: {out[0].replace('_', ' ')} is {usual.text(one.values[out[0]])}, people have "
                           f"{usual.text(usual.low)} to {usual.text(usual.high)}: look at its tape on the page")
+        doubts += [f"{name}: {reason}" for reason in implausible_measures(one.values)[:1]]
         doubts += [f"{name}: {turned}; name the model with -m" for turned in one.turned[:1]]
         # an open surface has no volume, so no weight: not a fault
         missing = [word for word in one.missing if word in CATALOGUE and word != "weight"]

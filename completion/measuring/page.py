@@ -52,11 +52,13 @@ def measures_page(names: Sequence[str], bodies: Sequence[np.ndarray], measured: 
         page.section("To be looked at").table(notes)
     page.section("How it is measured").text(
         "Where each tape runs was found once on the template, from its landmarks and its shape, and goes with the "
-        "vertices: the centre of every girth is the centre of the same ring of skin, and its plane is cut anew on each "
-        "body. Trunk, head and thighs are measured level, arms, shins and neck across their own axis. Lengths along "
-        "the skin are exact shortest ways over the same landmarks.\n\n"
-        "± is the error to be expected from what the scan showed of the body, root mean square; it is known of "
-        "completed bodies. It does not tell how far a landmark is from the bone that the standard names. The weight is "
+        "vertices. The waist is as high as the navel, the bust as the nipples, and hips are the widest of each body. "
+        "Trunk, head and thighs are measured level, arms, shins and neck across their own axis. Heights are those of "
+        "legs that are straight and upright. Lengths along the skin are exact shortest ways over the same "
+        "landmarks.\n\n"
+        "± is the error to be expected, root mean square. It has three sources: the surface, as far as the scan showed "
+        "it; the place of the tape along the body; and the pose, where the body was brought into another one. It does "
+        "not tell how far a landmark is from the bone that the standard names. The weight is "
         f"{DENSITY:.0f} kilograms for every cubic metre inside the skin, with lungs half full; people differ from that "
         f"by {100 * DENSITY_SPREAD:.0f}%, which is its ± at least.")
     return page.table([(_words(both), CATALOGUE[both[0]].standard) for both in _pairs()], ("here", "term and standard"))

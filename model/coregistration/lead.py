@@ -7,8 +7,8 @@
 """
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field
 from functools import lru_cache
 from pathlib import Path
 
@@ -44,7 +44,8 @@ class ModelLead:
     """A model that initialises a template on scans; made by `model_lead`.
 
     Each template vertex lies in a triangle of the model: `corners` (N, 3) are its vertices and `weights` (N, 3) the
-    barycentric coordinates. `off` (N,), metres, is the distance outside the skin.
+    barycentric coordinates. `off` (N,), metres, is the distance outside the skin. `landmarks` are the vertices of the
+    template nearest to those that the model names.
     """
 
     name: str                        # of the model, or its file
@@ -52,6 +53,7 @@ class ModelLead:
     weights: np.ndarray
     off: np.ndarray
     parts: PersonParts | None = None
+    landmarks: Mapping[str, int] = field(default_factory=dict)
 
     def carry(self, body: Mesh) -> np.ndarray:
         """Compute the template's vertices (N, 3), metres, on a body of the model."""
@@ -111,7 +113,10 @@ def model_lead(template: Mesh, through: str, progress: Callable[[int, int], None
     place = Surface(laid).closest(template.vertices)
     corners = laid.faces[place.faces]
     off = np.einsum("nd,nd->n", template.vertices - place.points, normals_at(laid, corners, place.bary))
-    return ModelLead(name, corners, place.bary, off, _parts(model, laid, template))
+    named = model.info.get("landmarks") or {}
+    nearest = cKDTree(template.vertices).query(laid.vertices[list(named.values())])[1] if named else ()
+    return ModelLead(name, corners, place.bary, off, _parts(model, laid, template),
+                     {mark: int(v) for mark, v in zip(named, nearest, strict=True)})
 
 
 def person_on(scan: Mesh | np.ndarray) -> tuple[Mesh, dict[str, int]] | None:

@@ -16,8 +16,8 @@ from .marks import BodyLandmarks, body_landmarks
 from .section import Carried, SectionCurve, direction, mean_of, on_the_way, part_around, section, tape
 from .tapes import Extent, Found, Girth, Height, Leg, Span, Straight, Tapes, Way, Weight
 
-# Metres that a level lies above its landmarks, on a person of 1.75 m. The built-in people's vertex named navel is at the
-# lower rim of the navel, and those named nipples 2.5 cm to the inside and below, as MakeHuman's targets of both show.
+# Metres that a level lies above its landmarks, on a person of 1.75 m. The built-in people's vertex named navel is at
+# the lower rim of the navel, those named nipples are 2.5 cm to the inside and below: MakeHuman's targets of both say so.
 NAVEL, NIPPLES = 0.009, 0.008
 
 
@@ -28,8 +28,8 @@ class _NotThereError(ValueError):
 def find_tapes(template: Mesh, landmarks: Mapping[str, int]) -> Tapes:
     """Find every measurement on a template that stands upright, its arms away from the body.
 
-    Waist and bust are as high as navel and nipples, ends of limbs are at landmarks. Hips and calves are the widest, neck
-    and wrists the narrowest sections between two landmarks.
+    Waist and bust are as high as navel and nipples, ends of limbs are at landmarks. Hips and calves are the widest,
+    neck and wrists the narrowest sections between two landmarks.
 
     Parameters
     ----------
@@ -361,7 +361,7 @@ class _Finder:
         for side, other in (("left", "right"), ("right", "left")):
             foot, shin, twin = found.get(f"foot_length_{side}"), *(
                 self.limbs.get(f"{each} shin") for each in (side, other))
-            if not isinstance(foot, Extent) or shin is None or twin is None or not {"left hip", "right hip"} <= set(p.of):
+            if not isinstance(foot, Extent) or shin is None or twin is None or f"{side} hip" not in p.of:
                 return ()
             # On the built-in people joints of the hips are 0.58 times as far apart as the skin beside them, and the
             # bones of the lower shins 0.95 times as far as the centres of their skin.

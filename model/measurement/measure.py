@@ -12,7 +12,7 @@ from scanprep.geometry.mesh import Mesh
 from .reading import NotMeasuredError, Reading, Standing, read_measurement
 from .tapes import Tapes
 
-REACH = 0.10                         # metres over which errors of the surface are correlated
+REACH = 0.15                         # metres over which errors of the surface are correlated
 PLACE = 0.007                        # metres from where a section or landmark should be, along the part
 MANY = 2000                          # vertices: the matrix of their distances takes 100 megabytes with intermediates
 
@@ -109,7 +109,7 @@ def measure(body: Mesh | np.ndarray, tapes: Tapes, axes: np.ndarray | None = Non
             readings[name] = read_measurement(tapes.found[name], standing, tapes)
         except NotMeasuredError as problem:
             missing[name] = str(problem)
-    errors = {name: measurement_error(reading, vertices, expected_error) for name, reading in readings.items()}
+    errors = {name: measurement_error(reading, standing.mesh, expected_error) for name, reading in readings.items()}
     return Measurements(readings, missing, find_turned_limbs(tapes, standing), axes, errors, vertices)
 
 
@@ -146,33 +146,40 @@ def find_turned_limbs(tapes: Tapes, body: Standing, share: float = 1.0) -> tuple
     return tuple(texts)
 
 
-def measurement_error(reading: Reading, vertices: np.ndarray, expected: np.ndarray | None) -> float:
+def measurement_error(reading: Reading, body: Mesh, expected: np.ndarray | None) -> float:
     """Compute the expected error of a measurement, root mean square, in its unit.
 
-    The derivative by the vertices is applied to errors that are isotropic and correlated over 10 cm. Errors by sliding
-    along the skin are added, and those that no surface shows.
+    The derivative by the vertices is applied to the errors of the surface. Errors of the place of the tape along the
+    skin are added, and those that no surface shows.
 
     Parameters
     ----------
     reading : Reading
         The measurement.
-    vertices : (N, 3) float, metres
+    body : Mesh, metres
         The body that was measured.
     expected : (N,) float, metres, optional
         Root mean square error of each vertex, as of a completion; none for an exact surface.
     """
-    surface = 0.0 if expected is None else surface_error(reading, vertices, expected)
+    surface = 0.0 if expected is None else surface_error(reading, body, expected)
     return float(np.sqrt(surface**2 + (PLACE * reading.slope)**2 + reading.unknown**2))
 
 
-def surface_error(reading: Reading, vertices: np.ndarray, expected: np.ndarray) -> float:
-    """Compute the error of a measurement by that of the surface, see `measurement_error`."""
-    pull = expected[reading.vertices][:, None] * reading.force / np.sqrt(3)
+def surface_error(reading: Reading, body: Mesh, expected: np.ndarray) -> float:
+    """Compute the error of a measurement by that of the surface.
+
+    Errors are equal in all directions. Where the surface lies too far out, so does the skin within `REACH`: its error
+    along the normal is correlated. So is that along the surface, as a vector.
+    """
+    vertices, ids = body.vertices, reading.vertices
+    pull = expected[ids][:, None] * reading.force / np.sqrt(3)
+    out = np.einsum("kd,kd->k", pull, body.vertex_normals[ids])
+    parts = np.column_stack([out, pull - out[:, None] * body.vertex_normals[ids]])
     # with thousands of vertices, those in one cube of a quarter of the reach are summed: their errors are alike
-    cubes = vertices if len(np.unique(reading.vertices)) < MANY else np.floor(vertices / (0.25 * REACH))
-    first, place = np.unique(cubes[reading.vertices], axis=0, return_index=True, return_inverse=True)[1:]
-    sums = np.zeros((len(first), 3))
-    np.add.at(sums, place.ravel(), pull)
-    points = vertices[reading.vertices[first]]
+    cubes = vertices if len(np.unique(ids)) < MANY else np.floor(vertices / (0.25 * REACH))
+    first, place = np.unique(cubes[ids], axis=0, return_index=True, return_inverse=True)[1:]
+    sums = np.zeros((len(first), 4))
+    np.add.at(sums, place.ravel(), parts)
+    points = vertices[ids[first]]
     together = np.exp(-0.5 * (np.linalg.norm(points[:, None] - points, axis=2) / REACH)**2)
     return float(np.sqrt(max(np.einsum("id,ij,jd->", sums, together, sums), 0)))

@@ -5,25 +5,18 @@ from collections.abc import Mapping
 
 from .catalogue import CATALOGUE, plain
 
-# Quotients of two measurements, least and largest. TODO
+# Least and largest quotient of two measurements. People made from other shapes than the built-in ones, 30 of them, and
+# 300 of the built-in ones stay inside by a third of the range or more, also heavy ones.
 QUOTIENTS: dict[tuple[str, str], tuple[float, float]] = {
-    ("neck_height", "stature"): (0.80, 0.90),
-    ("shoulder_height", "stature"): (0.76, 0.88),
-    ("waist_height", "stature"): (0.53, 0.67),
-    ("crotch_height", "stature"): (0.40, 0.54),
-    ("head_girth", "stature"): (0.28, 0.42),
-    ("arm_length", "stature"): (0.27, 0.40),
-    ("hand_length", "stature"): (0.08, 0.13),
-    ("foot_length", "stature"): (0.12, 0.18),
-    ("back_length", "stature"): (0.20, 0.32),
-    ("neck_girth", "head_girth"): (0.45, 0.95),
-    ("under_bust_girth", "chest_girth"): (0.75, 1.08),
-    ("waist_girth", "chest_girth"): (0.60, 1.25),
-    ("waist_girth", "hip_girth"): (0.58, 1.25),
-    ("chest_girth", "hip_girth"): (0.70, 1.35),
-    ("thigh_girth", "hip_girth"): (0.45, 0.75),
-    ("calf_girth", "thigh_girth"): (0.45, 0.85),
-    ("wrist_girth", "upper_arm_girth"): (0.30, 0.75)}
+    ("neck_height", "stature"): (0.82, 0.91), ("shoulder_height", "stature"): (0.77, 0.88),
+    ("waist_height", "stature"): (0.54, 0.68), ("crotch_height", "stature"): (0.41, 0.55),
+    ("head_girth", "stature"): (0.27, 0.40), ("arm_length", "stature"): (0.24, 0.36),
+    ("hand_length", "stature"): (0.085, 0.135), ("foot_length", "stature"): (0.115, 0.18),
+    ("back_length", "stature"): (0.20, 0.33), ("neck_girth", "head_girth"): (0.40, 0.90),
+    ("under_bust_girth", "chest_girth"): (0.70, 1.05), ("waist_girth", "chest_girth"): (0.55, 1.35),
+    ("waist_girth", "hip_girth"): (0.50, 1.30), ("chest_girth", "hip_girth"): (0.55, 1.45),
+    ("thigh_girth", "hip_girth"): (0.42, 0.72), ("calf_girth", "thigh_girth"): (0.45, 0.90),
+    ("wrist_girth", "upper_arm_girth"): (0.28, 0.75)}
 SIDES = 0.12                         # of their mean, by which left and right differ at most
 
 
@@ -43,7 +36,7 @@ def implausible_measures(values: Mapping[str, float]) -> list[str]:
     Examples
     --------
     >>> implausible_measures({"stature": 1.75, "waist_height": 1.25, "waist_girth": 0.9, "hip_girth": 1.0})
-    ['waist height is 71% of stature, people have 53 to 67%: look at both tapes on the page']
+    ['waist height is 71% of stature, people have 54 to 68%: look at both tapes on the page']
     """
     reasons = []
     for (name, other), (low, high) in QUOTIENTS.items():

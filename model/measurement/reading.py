@@ -234,7 +234,7 @@ def _height(found: Height, body: Standing, tapes: Tapes) -> Reading:
 
 
 def _straighten(legs: Sequence[Leg], body: Standing) -> tuple[float, np.ndarray, np.ndarray]:
-    """Compute by how much a body is taller on straight, upright legs, metres; with the derivative (k, 3) by vertices."""
+    """Compute by how much a body is taller on straight, upright legs, metres, and the derivative by vertices."""
     value, ids, force = 0.0, [np.zeros(0, dtype=np.int64)], [np.zeros((0, 3))]
     for leg in legs:
         for upper, lower in itertools.pairwise(leg.centres):

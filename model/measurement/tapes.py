@@ -49,8 +49,9 @@ class Leg:
     """One leg: the joint of the hip, the centres of knee and shin, and the sole.
 
     `sole` are vertices that are on average `arch`, metres, above the floor that the foot stands on: a foot that is
-    turned a little keeps their mean, but not its lowest vertex. The way over the centres is longer than the leg by a bow, as knees are further ahead: `straight` is its share that a
-    straight leg has. `share` is the height of the hip above the ankle, over that of the first centre above the last.
+    turned a little keeps their mean, but not its lowest vertex. The way over the centres is longer than the leg by a
+    bow, as knees are further ahead: `straight` is its share that a straight leg has. `share` is the height of the hip
+    above the ankle, over that of the first centre above the last.
     """
 
     centres: tuple[Carried, Carried, Carried]

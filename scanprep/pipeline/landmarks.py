@@ -30,8 +30,9 @@ from ..geometry.surface import OrientedPoints, Surface
 from ..geometry.target import orient_by_mesh, target_of
 from ..judgement import size
 from ..ranges import Axis
+from ..registration.lead import lead_of
 from ..registration.matches import NORMALS
-from ..registration.person import average_person, find_landmarks
+from ..registration.person import average_person
 from ..registration.schedule import RegistrationConfig
 from ..registration.unit import resolve_unit
 from ..synthetic.landmarks import landmarks as landmarks_of_people
@@ -122,13 +123,19 @@ def template_and_landmarks(template: Path | None, space: Workspace, progress: Pr
     check_template(body)
     known = find_template_landmarks(template, body)
     named = translate_landmarks(known)
-    built_in = space.step("template", (body, known), lambda folder: find_landmarks(body, known, progress))
+    built_in = space.step("template", body, lambda folder: landmarks_of_person(body, progress))
     # names keep the spelling of the file
     landmarks = known | {name: vertex for name, vertex in built_in.items() if name not in named}
     if not landmarks:
         raise ValueError(f"{template}: expected landmarks in {name_of(template)}.landmarks.json beside it, or the body "
                          "of a person; found neither: click them with scape pick, or leave out --template")
     return body, landmarks
+
+
+def landmarks_of_person(template: Mesh, progress: Progress) -> dict[str, int]:
+    """Find the landmarks of the built-in people on a template, by laying them on it; none where they do not fit."""
+    lead = lead_of(template, "auto", progress)
+    return {} if lead is None else dict(lead.landmarks)
 
 
 def write_all(tasks: Sequence[ScanTask], template: Mesh, landmarks: Mapping[str, int], config: PrepareConfig,

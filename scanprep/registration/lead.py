@@ -6,7 +6,7 @@ import it.
 """
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Any, Protocol
@@ -25,10 +25,12 @@ class Lead(Protocol):
     The next body is sought only when it is asked for, so the first one comes fast.
     Landmarks are vertices (L,) of the template and points (L, 3), metres. `model` is the path of the model file, where
     it differs from the path the lead was made with. `up` is the axis of the scan that points up, where it is known.
+    `landmarks` are those that the model names, on the template.
     """
 
     name: str
     parts: PersonParts | None        # of the template, where the model is of people
+    landmarks: Mapping[str, int]
 
     def __call__(self, scan: Mesh | np.ndarray, landmarks: tuple[np.ndarray, np.ndarray] | None = None,
                  model: Path | None = None, up: Axis | None = None) -> Iterable[np.ndarray]: ...

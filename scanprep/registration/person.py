@@ -5,22 +5,18 @@ of people, before its first scan is registered.
 """
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
 from weakref import WeakKeyDictionary
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from ..correspondence.correlated import find_correspondences, find_seeds
 from ..geometry.format_glb import tallest
-from ..geometry.landmark_names import translate_landmarks
-from ..geometry.landmarks import match_landmarks
 from ..geometry.mesh import Mesh
 from ..geometry.surface import Surface
 from ..skeleton.tree import Skeleton
-from ..synthetic.landmarks import landmarks
 from ..synthetic.people import PARENTS, PARTS, SyntheticPerson
 from .nonrigid import Registration, register, share_stretched
 from .schedule import RegistrationConfig
@@ -72,7 +68,7 @@ def _find_parts(template: Mesh, report_progress: Callable[[int, int], None]) -> 
         # the template has the triangles of the synthetic people: no registration is needed
         part_of_face, vertices = person.part_of_face, template.vertices
     else:
-        fit = _person_on(template, None, RegistrationConfig(), report_progress)
+        fit = _person_on(template, report_progress)
         if fit is None:
             return None
         # each triangle takes the part of the nearest triangle of the registered average person
@@ -93,58 +89,19 @@ def has_limbs(template: Mesh) -> bool:
         return False
 
 
-def _person_on(template: Mesh, landmarks: tuple[np.ndarray, np.ndarray] | None, config: RegistrationConfig,
-               report_progress: Callable[[int, int], None]) -> Registration | None:
-    """Register the average person to a template, by landmarks or by limb ends; None where it does not fit."""
+def _person_on(template: Mesh, report_progress: Callable[[int, int], None]) -> Registration | None:
+    """Register the average person to a template by the ends of its limbs; None where it does not fit."""
+    if not has_limbs(template):
+        return None
     person = average_person().mesh
     matching = 30  # per cent of the progress bar; registration takes the rest
-    if landmarks is not None:
-        fit = register(person, template, landmarks, config, report_progress)
-    else:
-        if not has_limbs(template):
-            return None
-        seeds = find_seeds(person, template)
-        pairs = find_correspondences(person, template, (seeds.template_vertices, seeds.scan_points),
-                                     progress=lambda done, total: report_progress(round(matching * done / total), 100))
-        fit = register(person, template, None, config, correspondences=pairs, progress=lambda done,
-                       total: report_progress(
-            round(matching + (100 - matching) * done / total), 100))
+    seeds = find_seeds(person, template)
+    pairs = find_correspondences(person, template, (seeds.template_vertices, seeds.scan_points),
+                                 progress=lambda done, total: report_progress(round(matching * done / total), 100))
+    fit = register(person, template, None, RegistrationConfig(), correspondences=pairs, progress=lambda done,
+                   total: report_progress(round(matching + (100 - matching) * done / total), 100))
     # no person: more than 2% of the template uncovered, or more than 5% of the average person stretched to the double
     return None if fit.uncovered > 0.02 or share_stretched(person, fit.mesh) > 0.05 else fit
-
-
-def find_landmarks(template: Mesh, known: Mapping[str, int],
-                   progress: Callable[[int, int], None] | None = None) -> dict[str, int]:
-    """Find all landmarks of the synthetic people on a template of which some are known, or none.
-
-    The average person is registered to the template, by the known landmarks if there are at least four. Every other
-    landmark moves to the nearest vertex. They agree with clicks to a few centimetres in the middle of trunk and limbs,
-    better at their ends.
-
-    Parameters
-    ----------
-    template : Mesh
-        A person; without landmarks, one who stands.
-    known : name to vertex
-        In any spelling of `landmark_name`.
-    progress : callable, optional
-        Called with (done, total).
-
-    Returns
-    -------
-    dict of name to int
-        The known landmarks unchanged, by our names, then the others. Only the known ones where the average person does
-        not fit the template.
-    """
-    marks, known_marks = landmarks(), translate_landmarks(known)
-    names, vertices, places = match_landmarks(marks, known_marks, minimum=0)
-    # four known landmarks are enough to start from; with fewer, limb ends are used
-    led = (vertices, template.vertices[places]) if len(names) >= 4 else None
-    fit = _person_on(template, led, RegistrationConfig.quick(), progress or (lambda done, total: None))
-    if fit is None:
-        return known_marks
-    nearest = cKDTree(template.vertices).query(fit.mesh.vertices[list(marks.values())])[1]
-    return known_marks | {name: int(v) for name, v in zip(marks, nearest, strict=True) if name not in known_marks}
 
 
 @lru_cache(maxsize=1)
