@@ -34,8 +34,9 @@ ROOMS = {
         "viewer": "alignment batch depth_camera geometry pictures registration",
         "pipeline": "batch cleaning correspondence geometry pictures registration skeleton synthetic viewer"},
     "model": {
-        "fitting": "", "measurement": "", "motion": "", "resolution": "",
-        "export": "motion", "posing": "export fitting motion", "learning": "fitting posing resolution",
+        "fitting": "", "motion": "", "resolution": "",
+        "export": "motion", "posing": "export fitting motion resolution", "measurement": "posing",
+        "learning": "fitting posing resolution",
         "coregistration": "fitting learning", "statue": "export fitting motion", "evaluation": "fitting posing"},
     "completion": {
         "mocap": "", "partial": "mocap", "demo": "mocap partial", "tracking": "mocap partial",

@@ -58,7 +58,7 @@ def tape_template(file: Path | None, bodies: Sequence[Body], model: BodyModel | 
     ValueError
         The template has no landmarks, and the built-in people do not fit it.
     """
-    template, known = known_landmarks(file, bodies, model)
+    template, known = collect_landmarks(file, bodies, model)
     lacking = [name for name in MEASURED if name not in translate_landmarks(known)]
     people = lay_people(template) if lacking else None
     if people is not None:
@@ -77,7 +77,7 @@ def tape_template(file: Path | None, bodies: Sequence[Body], model: BodyModel | 
         return TapedTemplate(find_tapes(template, known), StandingModel(model, template))
     if people is None:
         tapes = find_tapes(template, known)
-        bent = bent_limb(tapes)
+        bent = find_bent_limb(tapes)
         if bent is None and all(stands(body.mesh.vertices, tapes) for body in bodies):
             return TapedTemplate(tapes, None)
         people = lay_people(template)
@@ -90,7 +90,8 @@ def tape_template(file: Path | None, bodies: Sequence[Body], model: BodyModel | 
     return TapedTemplate(find_tapes(upright, known), people)
 
 
-def known_landmarks(file: Path | None, bodies: Sequence[Body], model: BodyModel | None) -> tuple[Mesh, dict[str, int]]:
+def collect_landmarks(file: Path | None, bodies: Sequence[Body], model: BodyModel | None
+                      ) -> tuple[Mesh, dict[str, int]]:
     """Return the template of bodies, and the landmarks that are known of it.
 
     The template is the model's, else that of the set, else the first body. Landmarks are from the given file, the
@@ -127,7 +128,7 @@ def lay_people(template: Mesh) -> StandingModel | None:
             return None
 
 
-def bent_limb(tapes: Tapes) -> str | None:
+def find_bent_limb(tapes: Tapes) -> str | None:
     """Return which limb of a template does not hang or stand, so that tapes found on it would lie elsewhere."""
     for name, (first, second) in tapes.limbs.items():
         way = second.at(tapes.template.vertices) - first.at(tapes.template.vertices)

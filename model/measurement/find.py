@@ -17,7 +17,7 @@ from .section import Carried, SectionCurve, direction, mean_of, on_the_way, part
 from .tapes import Extent, Found, Girth, Height, Leg, Span, Straight, Tapes, Way, Weight
 
 # Metres that a level lies above its landmarks, on a person of 1.75 m. The built-in people's vertex named navel is at
-# the lower rim of the navel, those named nipples are 2.5 cm to the inside and below: MakeHuman's targets of both say so.
+# the lower rim of the navel, those named nipples are 2.5 cm inside and below: so say MakeHuman's targets.
 NAVEL, NIPPLES = 0.009, 0.008
 
 

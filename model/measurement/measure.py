@@ -161,11 +161,11 @@ def measurement_error(reading: Reading, body: Mesh, expected: np.ndarray | None)
     expected : (N,) float, metres, optional
         Root mean square error of each vertex, as of a completion; none for an exact surface.
     """
-    surface = 0.0 if expected is None else surface_error(reading, body, expected)
+    surface = 0.0 if expected is None else error_of_surface(reading, body, expected)
     return float(np.sqrt(surface**2 + (PLACE * reading.slope)**2 + reading.unknown**2))
 
 
-def surface_error(reading: Reading, body: Mesh, expected: np.ndarray) -> float:
+def error_of_surface(reading: Reading, body: Mesh, expected: np.ndarray) -> float:
     """Compute the error of a measurement by that of the surface.
 
     Errors are equal in all directions. Where the surface lies too far out, so does the skin within `REACH`: its error

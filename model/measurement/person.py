@@ -58,7 +58,7 @@ def measure_person(vertices: np.ndarray, tapes: Tapes, standing: StandingModel, 
     as_it_is = measure(vertices @ R.T + shift, tapes, axes, expected_error, [
         name for name, found in tapes.found.items() if keeps_in_pose(name, found)])
     readings, missing, errors = dict(upright.readings), dict(upright.missing), dict(upright.errors)
-    posed = pose_errors(upright.readings, tapes, standing, stood)
+    posed = errors_of_pose(upright.readings, tapes, standing, stood)
     for name in readings:
         errors[name] = float(np.hypot(errors[name], posed[name]))
     for name, reading in as_it_is.readings.items():
@@ -72,11 +72,12 @@ def measure_person(vertices: np.ndarray, tapes: Tapes, standing: StandingModel, 
 
 
 def keeps_in_pose(name: str, found: object) -> bool:
-    """Return whether a measurement is the same in every pose: one part alone carries it."""
-    return isinstance(found, Weight) or name == "waist_girth" or (isinstance(found, Girth) and found.axis is not None)
+    """Return whether a measurement is the same in every pose: one part alone carries it, and no joint is in it."""
+    return isinstance(found, Weight) or name == "waist_girth" or (
+        isinstance(found, Girth) and found.axis is not None and not name.startswith("knee"))
 
 
-def pose_errors(readings: Mapping[str, Reading], tapes: Tapes, standing: StandingModel, stood: StandingBody
+def errors_of_pose(readings: Mapping[str, Reading], tapes: Tapes, standing: StandingModel, stood: StandingBody
                 ) -> dict[str, float]:
     """Compute the error of each measurement, metres, by bringing a body from its pose into the standing one.
 
