@@ -14,10 +14,10 @@ _on: dict[str, object] = {}
 
 def once(find):
     """The average person on a template, sought once of all the commands that read the same one."""
-    def found(template, landmarks, config, tell):
-        key = Digests().of(template.vertices, template.faces, landmarks, config)
+    def found(template, tell):
+        key = Digests().of(template.vertices, template.faces)
         if key not in _on:
-            _on[key] = find(template, landmarks, config, tell)
+            _on[key] = find(template, tell)
         return _on[key]
 
     return found

@@ -19,7 +19,7 @@ ON_MARKERS = "mosh, animate"
 # who says what a function outside the modules of commands says; functions there are said by the commands beside them
 SAID_BY = {
     "completion/cli.py marks_of_template": "complete, track",
-    "completion/measuring/bodies.py landmarks_of": "measure",
+    "completion/measuring/template.py tape_template": "measure",
     "completion/mocap/animate/work.py betas_in_motion": "animate",
     "completion/mocap/labelling/work.py LabelWork.write": "label",
     "completion/mocap/marker_sets/named.py ": "mosh, animate, label",
@@ -151,7 +151,7 @@ def test_what_looks_for_a_person_takes_the_axis_that_is_up(command):
 
 def next_steps():
     """Yield place and expression of what commands print as `next:`."""
-    for path in sorted(each for package in ("scanprep", "model", "completion") for each in (ROOT / package).rglob("*.py")):
+    for path in sorted(each for name in ("scanprep", "model", "completion") for each in (ROOT / name).rglob("*.py")):
         for call in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
             if isinstance(call, ast.Call):
                 steps = [word.value for word in call.keywords if word.arg == "following"]

@@ -12,6 +12,7 @@ from model.posing.cli import read_subject
 from scanprep.dataset import RegisteredSet
 from scanprep.geometry.files import list_meshes, name_of, read_mesh
 from scanprep.geometry.mesh import Mesh
+from scanprep.registration.figures import UNSEEN, read_figures
 from scanprep.registration.unit import resolve_unit
 
 from ..partial.completion import Completion, load_completion
@@ -19,9 +20,10 @@ from ..viewing.kinds import model_of_report
 
 # files by which the folders of commands are recognised
 COMPLETED, PERSON, MOTION = "completion.npz", "subject.json", "motion.npz"
-# Expected errors of the surface, metres: of registered meshes, of whose scans nothing is known here, and of bodies made
-# from betas, which are as far from the person as the model's own error in `completion/partial/confidence.py`.
-REGISTERED, OF_BETAS = 0.002, 0.0075
+# Expected errors of the surface, metres: of registered meshes, whose skin is 1 mm from the scan and slides a little; of
+# what their scans do not show, as `scape complete` tells it of half views (11 to 18 mm on seven people); and of bodies
+# made from betas, which are as far from the person as the model's own error in `completion/partial/confidence.py`.
+REGISTERED, HIDDEN, OF_BETAS = 0.0015, 0.0125, 0.0075
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,9 +80,10 @@ def _bodies(path: Path, model: BodyModel | None, unit: str | None) -> Iterator[B
         yield _of_file(path, model, unit)
     elif (path / "set.json").exists():
         registered = RegisteredSet.load(path)
+        shown = {figures.name: figures.seen for figures in read_figures(path)}
         for entry in registered.entries:
             mesh = registered.template.with_vertices(registered.vertices([entry.name])[0])
-            yield Body(entry.name, mesh, path, everywhere(mesh, REGISTERED))
+            yield Body(entry.name, mesh, path, everywhere(mesh, registration_error(shown.get(entry.name, 1.0))))
     elif (path / COMPLETED).exists():
         completion = load_completion(path)
         yield Body(path.name, completion.completed, path, completion_error(completion))
@@ -103,6 +106,15 @@ def _of_file(path: Path, model: BodyModel | None, unit: str | None) -> Body:
     if path.name == "completed.ply" and (path.parent / COMPLETED).exists():
         return Body(name_of(path), mesh, path, completion_error(load_completion(path.parent)))
     return Body(name_of(path), mesh, path, everywhere(mesh, REGISTERED))
+
+
+def registration_error(seen: float) -> float:
+    """Compute the expected error of a registered mesh, metres, whose scan shows a share of the surface.
+
+    What scans from all sides leave without data is small and lies between data, so it counts as seen.
+    """
+    hidden = max(0.0, 1 - seen - UNSEEN) / (1 - UNSEEN)
+    return float(np.sqrt((1 - hidden) * REGISTERED**2 + hidden * HIDDEN**2))
 
 
 def completion_error(completion: Completion) -> np.ndarray:
