@@ -82,6 +82,14 @@ def test_what_was_said_about_the_scans_holds_for_the_model(folder, tmp_path, ver
     assert outcome.judgement.verdict == verdict if verdict != "good" else outcome.judgement.verdict != "failed"
 
 
+def test_one_person_alone_shows_no_shapes(folder, tmp_path, monkeypatch):
+    """It took as long as the skeleton takes to say so."""
+    monkeypatch.setattr("model.learning.cli._find_skeleton", None)
+    write_mesh(tmp_path / "one" / "anna.ply", RegisteredSet.load(folder / "set").template)
+    with pytest.raises(ValueError, match="shapes: expected at least 2 people, got 1 in"):
+        learned(folder / "poses", tmp_path / "m.npz", tmp_path / "one")
+
+
 def test_models_by_sex_stand_beside_the_neutral_one(folder, tmp_path):
     outcome = learned(folder / "set", tmp_path / "m.npz", folder / "set", by_sex=True, scape=QUICK)
     count = {name: load_model(tmp_path / f"m{name}.npz").info["shapes"] for name in ("", ".female", ".male")}

@@ -11,6 +11,7 @@ from completion.__main__ import COMMANDS
 from scanprep.command_line import Arguments, list_commands, load_command
 
 ROOT = Path(__file__).parents[1]
+PACKAGES = "scanprep", "model", "completion"
 FLAG = re.compile(r"(?<![\w-])(--[a-z][a-z-]+)(?:[ =]([a-z]+))?")
 OTHER = re.compile(r"scape(?: [a-z][a-z-]*)+(?=[^,;:()]*$)")      # another command, to which the flag behind it belongs
 ON_SCANS = "complete, track, measure, statue fit, prep register, prep run, prep landmarks"
@@ -113,7 +114,7 @@ def who_says(place, function):
     return own or beside
 
 
-ALL = [(str(path.relative_to(ROOT)), function, text) for package in ("scanprep", "model", "completion")
+ALL = [(str(path.relative_to(ROOT)), function, text) for package in PACKAGES
        for path in sorted((ROOT / package).rglob("*.py")) for function, text in sayings(path)
        if str(path.relative_to(ROOT)) not in MACHINERY]
 
@@ -151,7 +152,7 @@ def test_what_looks_for_a_person_takes_the_axis_that_is_up(command):
 
 def next_steps():
     """Yield place and expression of what commands print as `next:`."""
-    for path in sorted(each for name in ("scanprep", "model", "completion") for each in (ROOT / name).rglob("*.py")):
+    for path in sorted(path for package in PACKAGES for path in (ROOT / package).rglob("*.py")):
         for call in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
             if isinstance(call, ast.Call):
                 steps = [word.value for word in call.keywords if word.arg == "following"]

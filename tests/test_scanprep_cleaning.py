@@ -13,6 +13,7 @@ from scanprep.cleaning.clean_scan import (
     SPECKS,
     CleanScanConfig,
     clean_scan,
+    cleaning_doubts,
     label_pieces,
     take_clutter,
 )
@@ -247,3 +248,25 @@ def test_nothing_is_an_error(monkeypatch):
     monkeypatch.setattr(floor_finding, "SIGMAS", 10)
     with pytest.raises(ValueError, match="nothing is left"):
         clean_scan(bare, CleanScanConfig())
+
+
+def plinth(width, height, closed, spacing=0.008):
+    """The top and the sides of a block under the origin, and its bottom where it is closed."""
+    side = grid(width, height, spacing)
+    upright = [rotations.exp([0, 0, turn]) @ rotations.exp([np.pi / 2, 0, 0]) for turn in np.pi / 2 * np.arange(4)]
+    top = grid(width, width, spacing)
+    return [top, *([moved(top, [0, 0, -height])] if closed else []),
+            *(moved(side, R @ [0, 0, width / 2] - [0, 0, height / 2], R) for R in upright)]
+
+
+@pytest.mark.parametrize(("width", "height", "goes"), [(0.6, 0.3, True), (0.7, 1.0, False)])
+def test_a_pedestal_goes_with_its_top_or_is_doubted(width, height, goes):
+    """It was kept and called good; as high as a seat it might be part of somebody who sits."""
+    body = SyntheticPerson().mesh
+    body = moved(body, [*-body.vertices.mean(axis=0)[:2], -body.vertices[:, 2].min()])
+    pieces = [body, *plinth(width, height, closed=not goes)]
+    first = np.cumsum([0, *(len(piece.vertices) for piece in pieces)])
+    cleaned = clean_scan(Mesh(np.concatenate([piece.vertices for piece in pieces]),
+                              np.concatenate([piece.faces + n for piece, n in zip(pieces, first, strict=False)])))
+    assert (cleaned.mesh.vertices[:, 2] < -0.02).any() != goes and bool(cleaning_doubts(cleaned)) != goes
+    assert cleaned.kept[:len(body.vertices)].mean() > 0.97

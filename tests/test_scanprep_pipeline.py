@@ -103,7 +103,7 @@ def test_folders_that_cannot_be_meant(scans, tmp_path):
 
 
 @pytest.mark.parametrize("text, says", [
-    ("name,subject\nnobody,anna\n", r"scans\.csv: no scan is called nobody"),
+    ("name,subject\nnobody,anna\n", r"scans\.csv: no scan is called nobody; the scans are called body0, "),
     ("scan,subject\nbody0,anna\n", "line 1: expected the columns name,subject"),
     ("name,subject\nbody0,anna\nbody0,ben\n", "body0 comes twice")])
 def test_tables_that_cannot_be_meant(scans, text, says):

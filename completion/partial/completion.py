@@ -347,9 +347,11 @@ def completion_problem(done: Completion, points: np.ndarray, free_scale: bool = 
         return None
     # name the likely cause: the unit, the landmarks, or another subject
     marks = "" if np.isnan(done.landmark_rms) else f", the landmarks are {1000 * done.landmark_rms:.0f} mm off"
+    beside = "a second person or clutter, which scape prep clean takes off, or " if done.measured > CROWDED else ""
     return (f"the body explains {100 * done.explained:.0f}% of the scan, {100 * done.measured:.2g}% of it has "
             f"data{marks}; " + (wrong or ("landmarks of other places, left and right exchanged, or " if marks else "")
-                                + "a scan of something else, its up axis to be named (--up), or another model?"))
+                                + f"{beside}a scan of something else, its up axis to be named (--up), or another "
+                                "model?"))
 
 
 def save_completion(folder: str | Path, completion: Completion) -> Path:

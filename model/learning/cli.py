@@ -102,7 +102,7 @@ def learn(poses: Path, output: Output, shapes: Path | None = None, template: Pat
         body, posed, who = whole.template, whole.vertices(), [one.subject or one.name for one in whole.entries]
     else:
         (body, posed), who = read_poses(poses, template, subject, unit), []
-    people = None if shapes is None else read_bodies(shapes, body, unit)[0]
+    people = None if shapes is None else _read_people(shapes, body, unit)
     sexes = None if not by_sex or shapes is None else _read_sexes(shapes)
     marks = landmarks or poses / "landmarks.json"
     named = read_landmark_vertices(marks, body) if landmarks or marks.exists() else {}
@@ -141,6 +141,15 @@ def learn(poses: Path, output: Output, shapes: Path | None = None, template: Pat
                    {"scape": scape, "skinning": skinning, "mixed": mixed},
                    judgement=judge_model(models["neutral"], people).merge(of_scans),
                    following=f"look at it: scape view {quote(str(output))}")
+
+
+def _read_people(shapes: Path, body: Mesh, unit: Unit | None) -> np.ndarray:
+    """Read the people (n, N, 3) whose differences are learned; one alone is refused before the skeleton is sought."""
+    people = read_bodies(shapes, body, unit)[0]
+    if len(people) < 2:
+        raise ValueError(f"shapes: expected at least 2 people, got {len(people)} in {shapes}; a model of the poses of "
+                         "one person needs none")
+    return people
 
 
 def _about_steps(step: KeptSteps) -> list[Metric]:

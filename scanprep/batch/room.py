@@ -5,7 +5,7 @@ import contextlib
 import os
 import shutil
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol, TypeVar
@@ -98,19 +98,37 @@ class TaskContext:
 
 def attempt(work: Any, job: Job, report_progress: Progress | None = None) -> Any:
     """Run a job; return its result, or a Failure, so that an error stops no other task."""
-    folder = job.folder / job.place
+    folder, files = job.folder / job.place, [str(path) for path in paths_of(job.given)] or [job.name]
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        with one_thread():              # results are the same to the last digit wherever it runs
+        with _notes_of(files), one_thread():              # results are the same to the last digit wherever it runs
             return work(job.given, TaskContext(folder, job.steps, report_progress, job.force))
     except Exception as error:
         text = " ".join(str(error).split())
         # an unexpected kind of error is named, for whoever reports it
         if not isinstance(error, ValueError | OSError | ModuleNotFoundError):
             text = f"{type(error).__name__}: {text}"
-        # every failure names a file of the task
-        files = [str(path) for path in paths_of(job.given)] or [job.name]
-        return Failure(text if any(file in text for file in files) else f"{files[0]}: {text}")
+        return Failure(_name_file(text, files))
+
+
+def _name_file(text: str, files: Sequence[str]) -> str:
+    """Return a text that names a file of a task; one that names none gets the first in front."""
+    return text if any(file in text for file in files) else f"{files[0]}: {text.removeprefix('scan: ')}"
+
+
+@contextlib.contextmanager
+def _notes_of(files: Sequence[str]) -> Iterator[None]:
+    """Make our warnings name a file of the task while the block runs, as they come from several tasks."""
+    show = warnings.showwarning
+
+    def show_with_file(message: Warning | str, *rest: Any, **named: Any) -> None:
+        show(UserWarning(_name_file(str(message), files)), *rest, **named)
+
+    warnings.showwarning = show_with_file
+    try:
+        yield
+    finally:
+        warnings.showwarning = show
 
 
 def attempt_elsewhere(work: Any, job: Job) -> tuple[Any, list[str]]:

@@ -16,6 +16,7 @@ from .floor import Plane, find_plane, floor_points
 
 LARGEST, LANDMARKS, NEAR = "the largest piece", "the piece with the landmarks", "near the body"
 MUTUAL, SPARSE = 6, 3.0              # neighbours linked in sparse regions, and their largest distance in links
+FLAT = 0.02                          # share of the points that a plane has which stays; both soles have 0.01
 FAR, SPECKS, FLOOR = "apart from the body", "specks", "a plane with all on one side, and what is below it"
 
 
@@ -74,6 +75,7 @@ class CleanedScan:
     label: np.ndarray                       # (N,) the index in `components` of every point of the raw scan
     components: tuple[Component, ...]       # planes, then pieces, largest first, then all specks together
     floor: Plane | None                     # on which the body stands
+    flat: bool = False                      # a large plane was kept, as it is part of the largest piece
 
     @property
     def mesh(self) -> Mesh:
@@ -82,7 +84,13 @@ class CleanedScan:
 
 
 def cleaning_doubts(found: CleanedScan) -> list[str]:
-    """Explain why a cleaned scan needs a look: a dropped piece may be a second person."""
+    """Explain why a cleaned scan needs a look: a pedestal may be left, and a dropped piece may be a second person."""
+    return second_person(found) + (["a large flat face was kept: a pedestal or furniture that touches the person?"]
+                                   if found.flat else [])
+
+
+def second_person(found: CleanedScan) -> list[str]:
+    """Name a dropped piece that may be a second person."""
     body = max((max(piece.size) for piece in found.components if piece.kept), default=0.0)
     points = max((piece.points for piece in found.components if piece.kept), default=0)
     # a dropped piece with half of the body's extent, as a child has, and a quarter of its points may be a person
@@ -105,7 +113,7 @@ def take_clutter(scan: Mesh | np.ndarray) -> tuple[Mesh | np.ndarray, float]:
         return scan, 0.0
     removed = 1 - float(cleaned.kept.mean())
     # floor, chair and specks have about 0.1 of the points
-    return (cleaned.scan, removed) if 0 < removed <= 0.2 and not cleaning_doubts(cleaned) else (scan, 0.0)
+    return (cleaned.scan, removed) if 0 < removed <= 0.2 and not second_person(cleaned) else (scan, 0.0)
 
 
 def clean_scan(scan: Mesh | np.ndarray, config: CleanScanConfig | None = None, landmarks: np.ndarray | None = None,
@@ -153,7 +161,7 @@ def clean_scan(scan: Mesh | np.ndarray, config: CleanScanConfig | None = None, l
     step = spacing(points)
     link = max(0.012, config.spacings * step)                       # at least 12 mm, about the spacing of a coarse scan
     # planes first; then the pieces of the rest, and which of them is the body
-    label, planes = _without_planes(mesh, link, config, landmarks, rng)
+    label, planes, flat = _without_planes(mesh, link, config, landmarks, rng)
     rest = np.flatnonzero(label < 0)
     if not len(rest):
         raise ValueError("scan: nothing is left when planes are taken off; expected a body in front of them")
@@ -180,7 +188,7 @@ def clean_scan(scan: Mesh | np.ndarray, config: CleanScanConfig | None = None, l
         rows.append(_component(mesh, own, gap, reason in (why, NEAR), reason))
     kept = np.array([row.kept for row in rows])[label]
     floor = next((p for p in planes if p.height(body.data).min() <= config.gap), None)
-    return CleanedScan(_only(scan, kept), kept, label, tuple(rows), floor)
+    return CleanedScan(_only(scan, kept), kept, label, tuple(rows), floor, flat)
 
 
 def _as_mesh(scan: Mesh | np.ndarray) -> Mesh:
@@ -189,23 +197,30 @@ def _as_mesh(scan: Mesh | np.ndarray) -> Mesh:
 
 
 def _without_planes(mesh: Mesh, link: float, config: CleanScanConfig, landmarks: np.ndarray | None,
-                    rng: np.random.Generator) -> tuple[np.ndarray, list[Plane]]:
-    """Find floors and walls: the number of the plane of each vertex (N,), -1 for none, and the planes."""
-    points, planes = mesh.vertices, list[Plane]()
+                    rng: np.random.Generator) -> tuple[np.ndarray, list[Plane], bool]:
+    """Find floors and walls: the number of the plane of each vertex (N,), -1 for none, and the planes.
+
+    Also tell whether there is a plane that was kept: one inside the footprint of the body, as the side of a pedestal.
+    """
+    points, planes, kept = mesh.vertices, list[Plane](), list[Plane]()
     label = np.full(len(points), -1)
-    while len(planes) < config.planes and (label < 0).sum() > config.min_points:
+    while len(planes) < config.planes and len(kept) <= config.planes and (label < 0).sum() > config.min_points:
         rest = np.flatnonzero(label < 0)
         plane = find_plane(points[rest], config.floor_area, rng,
-                           None if config.up is None else np.array(direction_of(config.up)))
+                           None if config.up is None else np.array(direction_of(config.up)), kept)
         if plane is None:
             break
         # the body stands on the plane; its footprint is not removed
         standing = rest[plane.height(points[rest]) > plane.thickness]
         piece = label_pieces(mesh, standing, link)
         body = standing[piece == _body_of(points[standing], piece, config, landmarks)[0]] if len(standing) else standing
-        label[rest[floor_points(points[rest], plane, points[body])]] = len(planes)
-        planes.append(plane)
-    return label, planes
+        off = rest[floor_points(points[rest], plane, points[body])]
+        (planes if len(off) else kept).append(plane)
+        label[off] = len(planes) - 1
+    # what is left of a pedestal went with its top
+    left = points[label < 0]
+    flat = any(np.mean(np.abs(plane.height(left)) <= plane.thickness) > FLAT for plane in kept)
+    return label, planes, flat
 
 
 def label_pieces(mesh: Mesh, chosen: np.ndarray, link: float) -> np.ndarray:

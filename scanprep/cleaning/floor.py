@@ -1,6 +1,7 @@
 """Find the floor under a scanned body, and separate it from the soles."""
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -41,12 +42,13 @@ class Plane:
         return Plane(-self.normal, -self.offset, self.noise)
 
 
-def find_plane(points: np.ndarray, min_area: float, rng: np.random.Generator, up: np.ndarray | None = None
-               ) -> Plane | None:
+def find_plane(points: np.ndarray, min_area: float, rng: np.random.Generator, up: np.ndarray | None = None,
+               kept: Sequence[Plane] = ()) -> Plane | None:
     """Find the largest plane with nearly all points (n, 3) on it or on one side; None below `min_area` m².
 
     Behind it there may be the pedestal whose top it is. Candidates are tangent planes at random points; the best one is
-    refined on ever closer points. With the direction `up` (3,) given, only floors are found.
+    refined on ever closer points. With the direction `up` (3,) given, only floors are found; none is one of the
+    planes that were `kept`.
     """
     sample = points[rng.permutation(len(points))[:10_000]]
     tree = cKDTree(sample)
@@ -62,6 +64,8 @@ def find_plane(points: np.ndarray, min_area: float, rng: np.random.Generator, up
         if np.mean(height < -WIDEST) > np.mean(height > WIDEST):
             plane, height = plane.flip(), -height
         if up is not None and plane.normal @ up < STEEPEST:
+            continue
+        if any(plane.normal @ other.normal > STEEPEST and abs(plane.offset - other.offset) < WIDEST for other in kept):
             continue
         if np.mean(height < -WIDEST) > most_below and not _is_pedestal(plane, sample):
             continue

@@ -57,7 +57,8 @@ def find_scans(folder: str | Path, landmarks: str | Path | None = None, subject:
     about = _read_table(folder / TABLE)
     unknown = sorted(set(about) - set(paths))
     if unknown:
-        raise ValueError(f"{folder / TABLE}: no scan is called {', '.join(unknown[:5])}")
+        raise ValueError(f"{folder / TABLE}: no scan is called {', '.join(unknown[:5])}; the scans are called "
+                         f"{', '.join(list(paths)[:5])}")
     if landmarks and not means_none(landmarks) and not Path(landmarks).is_dir():
         raise ValueError(f"landmarks: expected a folder, there is none at {landmarks}")
     places = [folder / "landmarks", folder] if not landmarks else [] if means_none(landmarks) else [Path(landmarks)]

@@ -77,8 +77,8 @@ def nobody_problem(off: float, margin: float, size: str) -> str | None:
         return None
     return (f"no person who stands upright was found (the unit taken for {size}): a body bent onto the scan stays "
             f"{1000 * off:.0f} mm off, and {margin:.2f} times as far when it faces another way; something else, "
-            "several people, a pose that needs clicks, or, if photographs without a scale made it, to be brought to "
-            "metres first?")
+            "several people, a pedestal, a pose that needs clicks, or, if photographs without a scale made it, to be "
+            "brought to metres first?")
 
 
 def why_uncertain(off: float, margin: float, missed: float) -> str | None:
