@@ -79,6 +79,8 @@ def test_bodies_of_other_triangles_are_measured_standing(standing):
         assert 0 < rest.errors[name] < posed.errors[name], name
     calf = measure(bent, people_tapes(laid), only=["calf_girth_left"]).values["calf_girth_left"]
     assert posed.values["calf_girth_left"] == pytest.approx(calf, abs=1e-4)
+    raised, hanging = (each.errors["upper_arm_girth_left"] for each in (posed, rest))
+    assert raised > 1.2 * hanging, "skin folds at the shoulder, also where the arm is measured as it is"
     assert np.abs(posed.body - laid.template.vertices).max() < 0.03
 
 
@@ -102,3 +104,5 @@ def test_measures_of_people_are_plausible_and_misplaced_tapes_are_not():
                         ({"thigh_girth_right": 0.8 * values["hip_girth"]}, "thigh girth right is 80% of hip girth")):
         with pytest.raises(AssertionError, match=told):
             assert not implausible_measures({**values, **wrong}), implausible_measures({**values, **wrong})[0]
+    arms = {"upper_arm_girth_left": 0.30, "upper_arm_girth_right": 0.35}
+    assert implausible_measures(arms) and not implausible_measures(arms, dict.fromkeys(arms, 0.01))

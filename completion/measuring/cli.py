@@ -143,7 +143,7 @@ def judge_bodies(names: Sequence[str], all_measured: Sequence[Measurements], bod
             doubts.append(f"{name}: {out[0].replace('_', ' ')} is {usual.text(one.values[out[0]])}, people have "
                           f"{usual.text(usual.low)} to {usual.text(usual.high)}: look at its tape on the page")
         doubts += [f"{name}: {turned}; name the model with -m" for turned in one.turned[:1]]
-        doubts += [f"{name}: {reason}" for reason in implausible_measures(one.values)[:1]]
+        doubts += [f"{name}: {reason}" for reason in implausible_measures(one.values, one.errors)[:1]]
         # an open surface has no volume, so no weight: not a fault
         missing = [word for word in one.missing if word in CATALOGUE and word != "weight"]
         if missing:

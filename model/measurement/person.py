@@ -15,7 +15,7 @@ from scanprep.geometry.sides import split_side
 from ..posing.standing import StandingBody, StandingModel
 from .measure import Measurements, measure
 from .reading import Reading
-from .tapes import Girth, Span, Tapes, Weight
+from .tapes import Found, Girth, Span, Tapes, Weight
 
 # How far joints are from where the model has them, metres: those of limbs, and those of the spine, which bends over its
 # whole length. A tape changes by CREASE of its length when the joints beside it turn by one radian; beside means nearer
@@ -65,7 +65,9 @@ def measure_person(vertices: np.ndarray, tapes: Tapes, standing: StandingModel, 
         # the curve is that on the standing body, which the page shows
         drawn = readings[name].curve if name in readings else np.zeros((0, 3))
         readings[name] = replace(reading, curve=drawn)
-        errors[name] = as_it_is.errors[name]
+        # a neighbouring joint that turned folds the skin, or swells a muscle, that hangs when people are measured
+        errors[name] = float(np.hypot(as_it_is.errors[name], crease_error(readings[name], tapes.found[name], standing,
+                                                                          stood.pose)))
         missing.pop(name, None)
     return Measurements({name: readings[name] for name in tapes.found if name in readings}, missing, (), axes, errors,
                         stood.vertices)
@@ -82,13 +84,11 @@ def errors_of_pose(readings: Mapping[str, Reading], tapes: Tapes, standing: Stan
     """Compute the error of each measurement, metres, by bringing a body from its pose into the standing one.
 
     Where joint j is off by c, everything beyond it comes to lie (I - R_j) c from its right place. The derivative of
-    the measurement by these vertices carries it over. Beside a joint that turned, skin folds and stretches.
+    the measurement by these vertices carries it over. Skin that folds adds `crease_error`.
     """
     skeleton, parts = standing.model.skeleton, standing.parts
     R = rotations.exp(stood.pose)
     shift = np.eye(3) - R                                        # (J, 3, 3)
-    turned = np.linalg.norm(stood.pose, axis=1)
-    joints = standing.model.joint_regressor @ standing.model.template.vertices
     errors = dict[str, float]()
     for name, reading in readings.items():
         square = 0.0
@@ -96,10 +96,15 @@ def errors_of_pose(readings: Mapping[str, Reading], tapes: Tapes, standing: Stan
             beyond = skeleton.descends[parts[reading.vertices], j]
             sd = LIMB if split_side(skeleton.names[j])[1] else SPINE
             square += sd**2 * float(((reading.force[beyond].sum(axis=0) @ shift[j])**2).sum())
-        found = tapes.found[name]
-        if isinstance(found, Girth | Span):
-            near = np.exp(-(np.linalg.norm(joints - reading.curve.mean(axis=0), axis=1) / BESIDE)**2)
-            near[0] = 0
-            square += (CREASE * reading.value)**2 * float(near @ turned**2)
-        errors[name] = float(np.sqrt(square))
+        errors[name] = float(np.hypot(np.sqrt(square), crease_error(reading, tapes.found[name], standing, stood.pose)))
     return errors
+
+
+def crease_error(reading: Reading, found: Found, standing: StandingModel, pose: np.ndarray) -> float:
+    """Compute the error of a girth or breadth, metres, beside joints that turned by a pose (J, 3); 0 of all else."""
+    if not isinstance(found, Girth | Span):
+        return 0.0
+    joints = standing.model.joint_regressor @ standing.model.template.vertices
+    near = np.exp(-(np.linalg.norm(joints - reading.curve.mean(axis=0), axis=1) / BESIDE)**2)
+    near[0] = 0                                                  # the whole body turned
+    return CREASE * reading.value * float(np.sqrt(near @ (pose**2).sum(axis=1)))

@@ -1,6 +1,7 @@
 """Whether measurements are those of one person: shares of the stature, girths to each other, left to right."""
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 
 from .catalogue import CATALOGUE, plain
@@ -20,13 +21,15 @@ QUOTIENTS: dict[tuple[str, str], tuple[float, float]] = {
 SIDES = 0.12                         # of their mean, by which left and right differ at most
 
 
-def implausible_measures(values: Mapping[str, float]) -> list[str]:
+def implausible_measures(values: Mapping[str, float], errors: Mapping[str, float] | None = None) -> list[str]:
     """Find what no person measures so: a tape that lies elsewhere, or sides that were mixed up.
 
     Parameters
     ----------
     values : dict of str to float
         Metres, and kilograms of the weight, by names of the catalogue.
+    errors : dict of str to float, optional
+        Expected errors. Sides may differ by twice that of both more.
 
     Returns
     -------
@@ -48,7 +51,9 @@ def implausible_measures(values: Mapping[str, float]) -> list[str]:
                                f"{100 * low:.0f} to {100 * high:.0f}%: look at both tapes on the page")
     for left in (name for name in values if name.endswith("_left")):
         right = f"{plain(left)}_right"
-        if right in values and abs(values[left] - values[right]) > SIDES * 0.5 * (values[left] + values[right]):
+        unknown = 2 * math.hypot(*((errors or {}).get(side, 0.0) for side in (left, right)))
+        if right in values and (abs(values[left] - values[right])
+                                > SIDES * 0.5 * (values[left] + values[right]) + unknown):
             reasons.append(f"{_words(plain(left))} is {CATALOGUE[left].text(values[left])} left and "
                            f"{CATALOGUE[left].text(values[right])} right: look at both tapes on the page")
     return reasons
