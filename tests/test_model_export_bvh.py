@@ -121,11 +121,11 @@ def test_bvh_without_motion_is_one_frame_at_rest(rig, tmp_path):
 
 
 @pytest.mark.parametrize(("names", "how", "words"), [
-    (None, {"unit": "ft"}, "unit: expected one of m, mm, cm, in, got 'ft'"),
+    (None, {"unit": "ft"}, "unit: expected one of m, mm, cm, in, or its length in metres, got 'ft'"),
     (("a", "b", "c", "left arm"), {}, "without white space"), (None, {"rate": -1.0}, "rate")])
 def test_bad_bvh_is_refused(rig, tmp_path, names, how, words):
     with pytest.raises(ValueError, match=words):
         write_bvh(tmp_path / "a.bvh", replace(rig.skeleton, names=names or rig.skeleton.names), **how)
-    with pytest.raises(ValueError, match="unit: expected one of m, mm, cm, in, got 'ft'"):
+    with pytest.raises(ValueError, match="unit: expected one of m, mm, cm, in, or its length in metres, got 'ft'"):
         read_bvh(tmp_path / "no.bvh", "ft")
     assert not list(tmp_path.iterdir())
