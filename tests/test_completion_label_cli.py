@@ -208,6 +208,7 @@ def test_a_marker_set_of_opensim_is_a_layout(tmp_path):
             choose_layout(model, str(tmp_path / "bad.xml"), ())
 
 
+@pytest.mark.slow
 def test_a_layout_is_found_by_the_command(place, monkeypatch):
     """With little effort, of a person who stands still: which is what the verdict says."""
     for name, value in (("STARTS", 1), ("TRIED", 1), ("ROUNDS", 1), ("NAMED", 1),

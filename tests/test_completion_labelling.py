@@ -94,6 +94,7 @@ def test_two_people_who_pass_each_other_keep_their_markers():
     assert max(share_right(columns, truth), share_right(other, truth)) > 0.98
 
 
+@pytest.mark.slow
 def test_what_is_no_person_is_refused(one):
     subject, layout, places = one
     with pytest.raises(ValueError, match="expected a frame with at least 10 points, the best has 9"):

@@ -100,6 +100,7 @@ def test_the_table_has_partners_and_parts(person):
     assert "RBAK" in rows["RBAC"][1]
 
 
+@pytest.mark.slow
 def test_a_transfer_writes_layout_picture_and_registration(tmp_path, person, monkeypatch, capsys):
     """With a registration that is known: the command passes landmarks on by name and says how it went."""
     seen = {}

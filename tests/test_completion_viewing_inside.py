@@ -127,6 +127,7 @@ def test_landmarks_need_something_to_lie_on(app, files, model, tmp_path):
     assert len(state["entries"]) == 1 and app.contents[0].shapes[1].name == "half.landmarks.json"
 
 
+@pytest.mark.slow
 def test_a_depth_picture_is_shown_from_its_camera_and_completed(app, files, model, body):
     state = drop(app, files / "one.png")
     assert "drop its camera, one.camera.json" in state["note"] and not state["entries"]

@@ -61,6 +61,7 @@ def test_a_good_registration_stays_on_the_data(body, crab_model):
     assert mean_mm(found.mesh.vertices, truth) < 4
 
 
+@pytest.mark.slow
 def test_what_was_not_seen_follows_the_model(body, crab_model):
     truth = bent(body, *FAR)
     scan = scan_of(body, truth, lambda points, normals: normals[:, 1] > 0)
@@ -156,6 +157,7 @@ def test_one_scan_refuses_what_it_cannot_use(body, crab_model, given, words):
         register_with_model(crab_model.subject(), body, config=QUICK, **given)
 
 
+@pytest.mark.slow
 def test_rounds_refuse_what_they_cannot_use(body, crab_model):
     with pytest.raises(ValueError, match="subjects: expected 2"):
         coregister(crab_model, [body, body], subjects=["a"])

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from completion_bodies import worm_with_prior
 from jointed_bodies import bent, crab
 from scan_folders import QUICK, ball
 from test_scanprep_registration_start import BEND, small
@@ -11,6 +12,7 @@ from test_scanprep_registration_start import BEND, small
 from model.built_in import load_built_in_model
 from model.coregistration import lead
 from model.coregistration.lead import model_lead
+from model.fitting import search
 from scanprep import Mesh, read_mesh, write_mesh
 from scanprep.cli import group
 from scanprep.decimation.decimate import decimate
@@ -18,7 +20,7 @@ from scanprep.geometry.rotations import exp
 from scanprep.geometry.surface import Surface
 from scanprep.registration import person
 from scanprep.registration.cli import judge_registration
-from scanprep.registration.lead import lead_of
+from scanprep.registration.lead import find_scanned_person, lead_of
 from scanprep.registration.nonrigid import register
 from scanprep.registration.unmarked import Candidate, find_rival, register_by_any, weigh_doubts
 from scanprep.synthetic.people import BodyShape, SyntheticPerson, find_pose
@@ -160,3 +162,14 @@ def test_a_person_is_found_in_any_pose_and_lands_on_the_scan(tmp_path):
     rows = {m["metric"]: m["value"] for m in json.loads((tmp_path / "found.ply.report.json").read_text())["metrics"]}
     assert rows["led by"] == "model people"
     assert off(read_mesh(tmp_path / "found.ply").vertices, truth) < 0.01
+
+
+def test_what_is_no_person_is_not_searched_for_limbs(monkeypatch):
+    """A template of an animal waited half a minute for limbs that it does not have; a person is found."""
+    monkeypatch.setattr(search, "_solve_with_limbs", lambda *given: pytest.fail("limbs were searched"))
+    worm = worm_with_prior().template
+    assert find_scanned_person(worm.with_vertices([1, 1.05, 0.97] * worm.vertices)) is None
+    somebody = SyntheticPerson(BodyShape.like("female", weight=0.8)).mesh
+    mesh, landmarks = find_scanned_person(somebody)
+    assert Surface(mesh).closest(somebody.vertices).distances.mean() < 0.003
+    assert len(landmarks) == len(load_built_in_model().info["landmarks"])

@@ -90,6 +90,7 @@ def test_one_person_alone_shows_no_shapes(folder, tmp_path, monkeypatch):
         learned(folder / "poses", tmp_path / "m.npz", tmp_path / "one")
 
 
+@pytest.mark.slow
 def test_models_by_sex_stand_beside_the_neutral_one(folder, tmp_path):
     outcome = learned(folder / "set", tmp_path / "m.npz", folder / "set", by_sex=True, scape=QUICK)
     count = {name: load_model(tmp_path / f"m{name}.npz").info["shapes"] for name in ("", ".female", ".male")}
@@ -97,6 +98,7 @@ def test_models_by_sex_stand_beside_the_neutral_one(folder, tmp_path):
     assert {m.name: m.value for m in outcome.metrics}["people of the male model"] == 2
 
 
+@pytest.mark.slow
 def test_sexes_of_a_plain_folder_come_from_a_table(folder, tmp_path):
     with pytest.raises(ValueError, match="write sexes"):
         learned(folder / "poses", tmp_path / "n.npz", folder / "people", skeleton=folder / "skeleton.json", by_sex=True)

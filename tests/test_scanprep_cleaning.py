@@ -174,6 +174,7 @@ def test_what_a_depth_camera_did_not_see_is_not_taken_for_the_body(person):
     assert clean.kept[:-200].all() and not clean.kept[-200:].any()
 
 
+@pytest.mark.slow
 def test_clutter_goes_unasked_and_nothing_that_may_be_wanted(person):
     """A small box beside the person is taken off. A second person, a room, and a person alone stay as they are."""
     box = moved(ball(3, 0.1), [0.9, 0, 0.1])

@@ -197,6 +197,7 @@ def command(folder, *more):
                   "-o", str(folder / "points"), *more])
 
 
+@pytest.mark.slow
 def test_the_command_takes_one_scan_in_any_unit(crab_files, tmp_path):
     """Landmarks come out in the unit of the scan, in the table in metres."""
     assert command(tmp_path, "--format", "csv", "--unit", "mm") == 0

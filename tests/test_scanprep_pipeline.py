@@ -277,6 +277,7 @@ def test_little_clutter_is_taken_off_scans_without_landmarks(scans, template, tm
     assert clicked.removed == 0 and alone.removed == pytest.approx(4 / (len(body.vertices) + 4))
 
 
+@pytest.mark.slow
 def test_other_settings_or_template_do_all_anew(scans, template, tmp_path):
     tasks = find_scans(scans)[:2]
     prepare(tasks, template, MARKS, tmp_path / "set", QUICK)

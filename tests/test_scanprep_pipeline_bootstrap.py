@@ -146,6 +146,7 @@ def test_doubted_and_failed_scans_are_registered_through_what_the_others_teach(t
     assert calls[made:] == [(name, None) for name in BAD]
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("done")
 def test_scans_that_become_good_by_themselves_leave_nothing_behind(tmp_path, body, truth, calls):
     for number, name in enumerate(reversed(BAD)):

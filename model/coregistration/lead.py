@@ -126,7 +126,7 @@ def person_on(scan: Mesh | np.ndarray) -> tuple[Mesh, dict[str, int]] | None:
     # the search takes seconds: ask it only where the scan is as large as people are
     if unit_problem(extent(points), extent(model.template.vertices), "the scan is"):
         return None
-    for body in find_bodies(model, scan):
+    for body in find_bodies(model, scan, only_if_near=True):         # an animal took half a minute
         size = float(np.sqrt(body.face_areas.sum()))
         # the scan lies on the body, but for clothes and hair, and shows most of it
         shown = cKDTree(points).query(body.vertices)[0] < 0.03 * size

@@ -17,7 +17,7 @@ from scanprep.threads import one_thread
 from ..body import BodyModel
 from .bodies import FixedBody, as_body
 from .free_surface import free_surface
-from .limbs import with_limbs, with_standing
+from .limbs import ASTRAY, with_limbs, with_standing
 from .rounds import solve_jointly
 from .scale import check_size
 from .scan_fit import ScanFit, prepare_scan_fit
@@ -75,7 +75,7 @@ def lay_model(model: BodyModel, template: Mesh, progress: Callable[[int, int], N
 
 
 def find_bodies(model: BodyModel, scan: Mesh | np.ndarray, landmarks: Landmarks | None = None,
-                up: tuple[float, float, float] | None = None) -> Iterator[Mesh]:
+                up: tuple[float, float, float] | None = None, only_if_near: bool = False) -> Iterator[Mesh]:
     """Yield likely bodies of a model on a scan, each bent onto it where there are data, and computed on demand.
 
     First comes the best of the typical poses. Then come the best after re-initialisation of limbs, and another body
@@ -91,6 +91,8 @@ def find_bodies(model: BodyModel, scan: Mesh | np.ndarray, landmarks: Landmarks 
         Few vertices of the model and where they are on the scan.
     up : (3,) floats, optional
         The direction that is up in the scan, where people in it mostly stand.
+    only_if_near : bool
+        Yield nothing where the first body leaves `ASTRAY` of the scan unexplained, as in scans of something else.
 
     Raises
     ------
@@ -110,6 +112,8 @@ def find_bodies(model: BodyModel, scan: Mesh | np.ndarray, landmarks: Landmarks 
         return followed.with_vertices(followed.vertices / factor)
 
     best = _solve(fit, coarse, starts[0])
+    if only_if_near and coarse.find_unexplained(best, coarse.thin).mean() > ASTRAY:
+        return
     first = mesh_of(best)
     # a body with a limb in the wrong place leaves scan points uncovered: skip it
     lost = share_uncovered(scan, first, FAR * size) > LOST
