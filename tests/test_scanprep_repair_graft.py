@@ -7,7 +7,7 @@ from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.places import point_areas
 from scanprep.geometry.surface import Surface
 from scanprep.registration.nonrigid import covers, register
-from scanprep.repair.graft import bridge, graft
+from scanprep.repair.graft import bridge, find_missing, graft, with_islands
 from scanprep.repair.hole_filling import close
 from scanprep.surfaces.template import TemplateConfig, template_of_scan
 from scanprep.synthetic.landmarks import landmarks
@@ -97,3 +97,22 @@ def test_shares_of_a_surface_do_not_depend_on_how_densely_it_was_sampled(person)
     assert below @ areas / areas.sum() == pytest.approx(share, abs=0.02)
     there = dense[:, 2] < np.median(person.vertices[:, 2])
     assert there.mean() > share + 0.1 and there @ denser / denser.sum() == pytest.approx(share, abs=0.03)
+
+
+def test_a_piece_takes_what_it_encloses_and_the_largest_comes_first(person):
+    """A missing toe that touches the patch of its hole in one place is still one piece with one rim."""
+    tip, navel = (person.vertices[landmarks()[name]] for name in ("left middle finger", "navel"))
+    middle = person.corners.mean(axis=1)
+    ring = np.linalg.norm(middle - navel, axis=1)
+    chosen = (ring < 0.06) & (ring > 0.03)
+    assert len(person.submesh(chosen)[0].boundary_loops) > 1
+    whole = with_islands(person, chosen)
+    assert (whole >= chosen).all() and whole[ring < 0.02].all() and not whole[ring > 0.08].any()
+    assert len(person.submesh(whole)[0].boundary_loops) == 1
+    # of the person without a foot and a finger tip, the foot is found first
+    heel = person.vertices[landmarks()["left heel"]]
+    scan = cut_at(cut_at(person, heel[None], 0.12), tip[None], 0.03)
+    missing = find_missing(close(scan), person)
+    areas = [person.face_areas[one].sum() for one in missing]
+    assert len(areas) >= 2 and areas == sorted(areas, reverse=True)
+    assert np.linalg.norm(middle[missing[0]].mean(axis=0) - heel) < 0.15

@@ -67,10 +67,10 @@ def place(body, tmp_path_factory):
 
 def test_the_best_scan_becomes_a_template_in_one_command(place, body, tmp_path, capsys):
     out = tmp_path / "template.ply"
-    assert group(["template", str(place / f"{NAME}.ply"), "--unit", "mm", "--faces", "4000", "-o", str(out)]) == 0
+    assert group(["template", str(place / f"{NAME}.ply"), "--unit", "mm", "--faces", "8000", "-o", str(out)]) == 0
     said, made = capsys.readouterr(), read_mesh(out)
     assert template_problem(made) is None and made.is_closed and made.volume > 0
-    assert abs(len(made.faces) - 4000) < 20
+    assert abs(len(made.faces) - 8000) < 20
     assert len(made.vertices) - len(made.edges) + len(made.faces) == 2                  # a sphere: no handles
     there, back = off(made, body)
     assert there.mean() < 0.0015 and there.max() < 0.02 and np.percentile(back, 97) < 0.008

@@ -14,8 +14,8 @@ from ..geometry.surface import Surface
 from .manifold import repair
 
 # Lengths in metres. A patch over a hole in a smooth surface is within 4 mm of the body; what stands out by 8 mm is a
-# finger tip, a toe or an ear. The rim of a piece that fits lies within 12 mm of the border of its hole.
-PATCHED, LEAST, NEAR = 0.004, 0.008, 0.012
+# finger tip, a toe or an ear. The rim of a piece that fits lies within 15 mm of the border of its hole.
+PATCHED, LEAST, NEAR = 0.004, 0.008, 0.015
 
 
 def graft(scan: Mesh, closed: Mesh, body: Mesh) -> tuple[Mesh, int]:
@@ -61,14 +61,25 @@ def graft(scan: Mesh, closed: Mesh, body: Mesh) -> tuple[Mesh, int]:
 
 
 def find_missing(closed: Mesh, body: Mesh) -> list[np.ndarray]:
-    """Find the pieces of a body that stand out from a closed scan: masks (F,) of triangles."""
+    """Find the pieces of a body that stand out from a closed scan: masks (F,) of triangles, the largest first."""
     off = Surface(closed).closest(body.vertices).distances
     inside = (off > PATCHED)[body.faces].all(axis=1)
     a, b = body.faces[inside][:, [0, 1]].T, body.faces[inside][:, [1, 2]].T
     label = label_components(a.ravel(), b.ravel(), len(body.vertices))
     of_face = label[body.faces[:, 0]]
-    return [inside & (of_face == one) for one in np.unique(of_face[inside])
-            if off[np.unique(body.faces[inside & (of_face == one)])].max() > LEAST]
+    pieces = [with_islands(body, inside & (of_face == one)) for one in np.unique(of_face[inside])
+              if off[np.unique(body.faces[inside & (of_face == one)])].max() > LEAST]
+    # of several at the hole of one sole, the largest is the one that matters
+    return sorted(pieces, key=lambda chosen: -body.face_areas[chosen].sum())
+
+
+def with_islands(body: Mesh, chosen: np.ndarray) -> np.ndarray:
+    """Add to chosen triangles (F,) bool all that they enclose: where a missing toe touches the patch of its hole."""
+    # triangles hang together by their edges: at a vertex alone a piece only touches itself
+    a, b = body.face_pairs.T
+    apart = ~chosen[a] & ~chosen[b]
+    label = label_components(a[apart], b[apart], len(body.faces))
+    return chosen | (label != np.bincount(label[~chosen]).argmax())
 
 
 def bridge(points: np.ndarray, first: np.ndarray, second: np.ndarray) -> np.ndarray:

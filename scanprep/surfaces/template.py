@@ -198,7 +198,9 @@ def _finish(mesh: Mesh, faces: int, config: TemplateConfig, progress: Callable[[
         notes.append(f"{number_of(holes, 'hole was', 'holes were')} filled")
     report_progress(2, 4)
     mesh = close(mesh, config.fill)
-    mesh = smooth_taubin(close(drop_thin(mesh, config.thinnest), config.fill), rounds)
+    if person is None:                                   # a body that was joined has no other thin parts than people
+        mesh = close(drop_thin(mesh, config.thinnest), config.fill)
+    mesh = smooth_taubin(mesh, rounds)
     report_progress(3, 4)
     surface = Surface(mesh)
     if mesh.volume < 0:
@@ -211,10 +213,11 @@ def _finish(mesh: Mesh, faces: int, config: TemplateConfig, progress: Callable[[
         # least-error collapses may spend triangles on the noise of one side; shortest-edge collapses do not, but are
         # taken only where they cut off no hand: 0.001 of the surface are the tips of three fingers
         even = _improve(decimate(mesh, faces, replace(config.decimate, method="even")), surface, keep)
-        if share_lost(mesh, even) < share_lost(mesh, small) + 0.001:
-            notes.append(f"{100 * balance:.0f}% of the triangles were on the left side; made even, "
-                         f"{100 * (share_on_left(even) or 0.5):.0f}% are")
-            small, balance = even, share_on_left(even)
+        evened = share_on_left(even) or 0.5
+        if abs(evened - 0.5) < abs(balance - 0.5) and share_lost(mesh, even) < share_lost(mesh, small) + 0.001:
+            notes.append(f"{100 * balance:.0f}% of the triangles were on the left side; made even, {100 * evened:.0f}% "
+                         "are")
+            small, balance = even, evened
     if template_problem(small):                                  # decimation left a degenerate triangle
         small = close(small, config.fill)
     check_template(small, what)
