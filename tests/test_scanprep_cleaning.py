@@ -181,6 +181,9 @@ def test_clutter_goes_unasked_and_nothing_that_may_be_wanted(person):
     clean, removed = take_clutter(joined(person, box))
     np.testing.assert_array_equal(clean.vertices, person.vertices)
     assert removed == pytest.approx(len(box.vertices) / (len(box.vertices) + len(person.vertices)))
+    # one camera saw a hand whose forearm and upper arm it did not see: the person is 0.35 m away
+    hand = moved(ball(3, 0.05), [person.vertices[:, 0].max() + 0.4, 0, 1.0])
+    assert take_clutter(joined(person, hand))[1] == 0
     for scan in (person, joined(person, moved(person, [1.5, 0, 0])),
                  joined(person, moved(grid(5, 5, 0.02), [0, 0, -0.05])), np.zeros((0, 3))):
         assert take_clutter(scan) == (scan, 0.0)
