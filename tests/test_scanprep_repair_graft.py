@@ -6,6 +6,8 @@ import pytest
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.places import point_areas
 from scanprep.geometry.surface import Surface
+from scanprep.registration import nonrigid
+from scanprep.registration.matches import Fit
 from scanprep.registration.nonrigid import covers, register
 from scanprep.repair.graft import bridge, find_missing, graft, with_islands
 from scanprep.repair.hole_filling import close
@@ -47,6 +49,19 @@ def test_a_hole_in_a_smooth_surface_is_left_to_its_patch(person):
     scan = cut_at(person, person.vertices[landmarks()["navel"]][None], 0.03)
     same, pieces = graft(scan, close(scan), person)
     assert pieces == 0 and same is scan
+
+
+def test_a_fit_that_leaves_what_its_start_covers_is_not_kept(person, monkeypatch):
+    """Fingers beside a thigh were drawn to it, though the body that was found lay on the scan."""
+    hand = np.linalg.norm(person.vertices - person.vertices[landmarks()["left middle finger"]], axis=1) < 0.1
+    bent = person.vertices + 0.05 * hand[:, None]
+    monkeypatch.setattr(nonrigid, "snap_to_surface", lambda inputs, fit, config: Fit(bent))
+    fit = register(person, person, start=person.vertices)
+    np.testing.assert_allclose(fit.mesh.vertices, person.vertices, atol=1e-6)
+    # one that leaves nothing is kept
+    monkeypatch.setattr(nonrigid, "snap_to_surface", lambda inputs, fit, config: Fit(person.vertices + 0.001))
+    fit = register(person, person, start=person.vertices)
+    np.testing.assert_allclose(fit.mesh.vertices, person.vertices + 0.001, atol=1e-6)
 
 
 @pytest.mark.slow
