@@ -54,14 +54,14 @@ def test_a_hole_in_a_smooth_surface_is_left_to_its_patch(person):
 def test_a_fit_that_leaves_what_its_start_covers_is_not_kept(person, monkeypatch):
     """Fingers beside a thigh were drawn to it, though the body that was found lay on the scan."""
     hand = np.linalg.norm(person.vertices - person.vertices[landmarks()["left middle finger"]], axis=1) < 0.1
-    bent = person.vertices + 0.05 * hand[:, None]
-    monkeypatch.setattr(nonrigid, "snap_to_surface", lambda inputs, fit, config: Fit(bent))
-    fit = register(person, person, start=person.vertices)
-    np.testing.assert_allclose(fit.mesh.vertices, person.vertices, atol=1e-6)
-    # one that leaves nothing is kept
-    monkeypatch.setattr(nonrigid, "snap_to_surface", lambda inputs, fit, config: Fit(person.vertices + 0.001))
-    fit = register(person, person, start=person.vertices)
-    np.testing.assert_allclose(fit.mesh.vertices, person.vertices + 0.001, atol=1e-6)
+    bent, beside = person.vertices + 0.05 * hand[:, None], person.vertices + 0.001
+    monkeypatch.setitem(nonrigid.METHODS, "graph", lambda inputs, begin, config, progress: Fit(bent))
+    # the graph loses the hand: the final fit begins at the start; that loses it too: the start stays
+    for snapped, kept in ((lambda x: x, person.vertices), (lambda x: bent, person.vertices),
+                          (lambda x: beside, beside)):
+        monkeypatch.setattr(nonrigid, "snap_to_surface", lambda inputs, fit, config, to=snapped: Fit(to(fit.x)))
+        fit = register(person, person, start=person.vertices)
+        np.testing.assert_allclose(fit.mesh.vertices, kept, atol=1e-6)
 
 
 @pytest.mark.slow
@@ -93,7 +93,7 @@ def test_a_body_on_the_scan_keeps_its_fingers(person):
     size = float(np.sqrt(person.face_areas.sum()))
     scan = person.sample(20_000, np.random.default_rng(0))[0]
     fit = register(person, scan, start=person.vertices)
-    assert covers(person, scan, size) and set(fit.energies) == {"strain"}        # no graph was fitted
+    assert covers(person, scan, size)
     tips = person.vertices[[landmarks()[f"{side} middle finger"] for side in ("left", "right")]]
     # the points are 10 mm apart
     assert Surface(fit.mesh).closest(tips).distances.max() < 0.010
