@@ -99,23 +99,23 @@ def model_lead(template: Mesh, through: str, progress: Callable[[int, int], None
     name = BUILT_IN if through == "auto" else through
     model = model_at(name)
     laid = _in_same_triangles(model, template)
-    if laid is None:
+    try:
         # the body is found on the template as on any scan, and laid on it
-        try:
-            laid = lay_model(model, template, progress)
-        except WrongScaleError as error:
-            raise ValueError(f"template: {error}; make it with scape prep template, in its right unit") from error
-        except ModelMismatchError as error:
-            if through == "auto":
-                return None
-            raise ValueError(f"--through {through}: {error}") from error
+        laid = lay_model(model, template, progress) if laid is None else laid
+        parts = _parts(model, laid, template)
+    except WrongScaleError as error:
+        raise ValueError(f"template: {error}; make it with scape prep template, in its right unit") from error
+    except ModelMismatchError as error:
+        if through == "auto":
+            return None
+        raise ValueError(f"--through {through}: {error}") from error
     # every vertex of the template gets a place on the body, and a distance from its skin
     place = Surface(laid).closest(template.vertices)
     corners = laid.faces[place.faces]
     off = np.einsum("nd,nd->n", template.vertices - place.points, normals_at(laid, corners, place.bary))
     named = model.info.get("landmarks") or {}
     nearest = cKDTree(template.vertices).query(laid.vertices[list(named.values())])[1] if named else ()
-    return ModelLead(name, corners, place.bary, off, _parts(model, laid, template),
+    return ModelLead(name, corners, place.bary, off, parts,
                      {mark: int(v) for mark, v in zip(named, nearest, strict=True)})
 
 
@@ -162,6 +162,8 @@ def _parts(model: BodyModel, laid: Mesh, template: Mesh) -> PersonParts | None:
     if model.skeleton.names != PARTS:
         return None
     part = model.skeleton.part_of_face[Surface(laid).closest(template.corners.mean(axis=1)).faces]
+    if len(np.unique(part)) < len(PARTS):
+        raise ModelMismatchError("the model does not come to lie on the template: not every part lies on it")
     joints = model.skeleton.joint_regressor(model.template) @ laid.vertices
     return PersonParts(Skeleton(part, PARENTS, joints, PARTS),
                        model.skeleton.fit_rotations(model.template, laid.vertices))
