@@ -222,7 +222,7 @@ def register(template: Mesh, scan: Mesh | np.ndarray, landmarks: tuple[np.ndarra
         return snap_to_surface(inputs, fit, config)
 
     if begin.shape != (4, 4) and covers(template.with_vertices(begin), scan, inputs.size):
-        fit = first_that_stays(inputs, begin, scan, [
+        fit = choose_fit_that_stays(inputs, begin, scan, [
             fit_softly, lambda: snap_to_surface(inputs, Fit(begin), config),
             lambda: Fit(without_inverted(inputs.template, begin))])
     else:
@@ -258,20 +258,20 @@ def snap_to_surface(inputs: RegistrationProblem, fit: Fit, config: RegistrationC
     return replace(fit, x=without_inverted(inputs.template, fit.x))
 
 
-def first_that_stays(inputs: RegistrationProblem, start: np.ndarray, scan: Mesh | np.ndarray,
+def choose_fit_that_stays(inputs: RegistrationProblem, start: np.ndarray, scan: Mesh | np.ndarray,
                      ways: Sequence[Callable[[], Fit]]) -> Fit:
     """Return the first fit that leaves nothing of what its start, vertices (N, 3) on the scan, covers; else the last.
 
     Graphs, whose nodes are wider than fingers, made hands 15 to 28 mm worse, and fingers beside a thigh were drawn to
     it. 0.0005 of the surface are the tips of two fingers; a hand that ended 20 mm off left 0.0007.
     """
-    def uncovered(x: np.ndarray) -> float:
+    def measure_uncovered(x: np.ndarray) -> float:
         return share_uncovered(scan, inputs.template.with_vertices(x), 0.01 * inputs.size)
 
-    before = uncovered(start)
+    before = measure_uncovered(start)
     for way in ways:
         fit = way()
-        if uncovered(fit.x) <= before + 0.0005:
+        if measure_uncovered(fit.x) <= before + 0.0005:
             break
     return fit
 
