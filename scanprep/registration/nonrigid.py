@@ -259,7 +259,7 @@ def snap_to_surface(inputs: RegistrationProblem, fit: Fit, config: RegistrationC
 
 
 def choose_fit_that_stays(inputs: RegistrationProblem, start: np.ndarray, scan: Mesh | np.ndarray,
-                     ways: Sequence[Callable[[], Fit]]) -> Fit:
+                          ways: Sequence[Callable[[], Fit]]) -> Fit:
     """Return the first fit that leaves nothing of what its start, vertices (N, 3) on the scan, covers; else the last.
 
     Graphs, whose nodes are wider than fingers, made hands 15 to 28 mm worse, and fingers beside a thigh were drawn to
