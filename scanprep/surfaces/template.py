@@ -19,6 +19,7 @@ from ..geometry.surface import Surface
 from ..ranges import Settings
 from ..registration.nonrigid import share_uncovered
 from ..repair.graft import graft
+from ..repair.handles import count_handles, cut_handles
 from ..repair.hole_filling import FillConfig, close
 from ..repair.manifold import drop_thin, repair
 from ..skeleton.symmetry import find_symmetry
@@ -200,6 +201,7 @@ def _finish(mesh: Mesh, faces: int, config: TemplateConfig, progress: Callable[[
     mesh = close(mesh, config.fill)
     if person is None:                                   # a body that was joined has no other thin parts than people
         mesh = close(drop_thin(mesh, config.thinnest), config.fill)
+    mesh = cut_handles(mesh)
     mesh = smooth_taubin(mesh, rounds)
     report_progress(3, 4)
     surface = Surface(mesh)
@@ -223,10 +225,9 @@ def _finish(mesh: Mesh, faces: int, config: TemplateConfig, progress: Callable[[
     check_template(small, what)
     far = Surface(scanned).closest(small.corners.mean(axis=1)).distances > scanned.mean_edge
     report_progress(4, 4)
-    # genus by the Euler characteristic; triangles farther from the scan than its mean edge are filled
-    handles = 1 - (len(small.vertices) - len(small.edges) + len(small.faces)) // 2
-    return MadeTemplate(small, tuple(notes), float(small.face_areas[far].sum() / small.face_areas.sum()), handles,
-                        balance)
+    # triangles farther from the scan than its mean edge are filled
+    return MadeTemplate(small, tuple(notes), float(small.face_areas[far].sum() / small.face_areas.sum()),
+                        count_handles(small), balance)
 
 
 def _improve(mesh: Mesh, surface: Surface, keep: np.ndarray | None) -> Mesh:
