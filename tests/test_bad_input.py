@@ -172,6 +172,7 @@ def test_one_clear_line(place, capsys, case):
     assert sorted(place.rglob("*")) == before
 
 
+@pytest.mark.slow
 def test_the_good_files_are_good(place, capsys):
     """Or the cases above would prove nothing."""
     assert main(COMPLETE.split()) == 0

@@ -89,6 +89,7 @@ def test_what_a_picture_cannot_have_is_refused(model, body):
         complete(model, picture, None, replace(QUICK, up=(0.0, -1.0, 0.0)))
 
 
+@pytest.mark.slow
 def test_a_picture_goes_in_as_a_file_and_a_refusal_says_why(model, body, marks, tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(report, "HEIGHT", 60)
     replace(model, info={**model.info, "landmarks": {f"m{v}": int(v) for v in MARKS}}).save(tmp_path / "model.npz")

@@ -123,6 +123,7 @@ def test_landmarks_at_wrong_places_are_told():
     assert told.endswith("where the rings are: nose (1105 mm), left toe (300 mm)")
 
 
+@pytest.mark.slow
 def test_the_body_is_found_without_the_landmarks_that_are_doubted(case):
     body, _, seen, app = case
     marked(app, body, seen)

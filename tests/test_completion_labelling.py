@@ -184,6 +184,7 @@ def test_people_who_stand_apart_are_told_apart():
         separate_people(points[:, :20], 3)
 
 
+@pytest.mark.slow
 def test_a_layout_of_few_markers_is_enough(one):
     """The lower body alone: eight markers of each leg and four of the hips."""
     subject, layout, places = one

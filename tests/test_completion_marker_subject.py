@@ -59,6 +59,7 @@ def test_betas_come_back_from_markers_alone(model, layout):
     assert np.abs(again - found.residuals).mean() < 0.003          # two ways to a normal
 
 
+@pytest.mark.slow
 def test_it_does_not_matter_where_the_world_is(model, layout):
     _, sequence = carried(model, layout, BETAS)
     R = np.array([[0, 0, 1.0], [1, 0, 0], [0, 1, 0]])               # another axis is up
@@ -116,6 +117,7 @@ def test_markers_on_wands_and_without_their_bars_are_the_same_person(model, layo
     assert not found.judgement(layout).reasons
 
 
+@pytest.mark.slow
 def test_a_walk_of_somebody_the_model_was_not_learned_from(model, layout):
     person = SyntheticPerson(BodyShape.like("male", stature=1.88, weight=1.0))
     on_skin = load_layout("cmu41", person.mesh)

@@ -80,6 +80,7 @@ def test_labels_name_the_part(candidates, person):
             assert stem == name.removesuffix("_left").upper()
 
 
+@pytest.mark.slow
 def test_nobody_can_wear_markers_there(person, mirror):
     free = sitting_room(person, mirror)
     near = SurfaceGraph(person)
@@ -92,6 +93,7 @@ def test_nobody_can_wear_markers_there(person, mirror):
     assert sitting_room(person, mirror, thick=0.03).mean() < free.mean()
 
 
+@pytest.mark.slow
 def test_a_turned_body_has_the_same_candidates(candidates, person, base):
     turned = person.with_vertices(person.vertices @ exp(np.array([1.0, 0.5, -2.0])).T + 3)
     again = candidate_layout(turned, base, 114, skeleton=SyntheticPerson().skeleton)

@@ -149,6 +149,7 @@ def test_what_is_no_person_has_no_landmarks_to_measure_from(tmp_path, capsys):
     assert "measuring begins at landmarks of the template, and there are none" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_without_a_model_a_pose_is_told(folder, tmp_path, capsys, monkeypatch):
     """Where the built-in people do not come to lie on the template, nobody can be brought to stand."""
     monkeypatch.setattr(template, "lay_people", lambda mesh: None)
@@ -160,6 +161,7 @@ def test_without_a_model_a_pose_is_told(folder, tmp_path, capsys, monkeypatch):
     assert table(tmp_path / "m.csv")["bent"]["note"].startswith("the left shin is turned by")
 
 
+@pytest.mark.slow
 def test_a_set_and_people_who_are_known_by_their_triangles(folder, tmp_path):
     person = SyntheticPerson(BodyShape.like(weight=1.0))
     bodies = RegisteredSet.create(tmp_path / "set", person.mesh)
@@ -169,6 +171,7 @@ def test_a_set_and_people_who_are_known_by_their_triangles(folder, tmp_path):
     assert float(row["stature"]) == pytest.approx(person.anatomy.stature, abs=0.005) and row["note"] == ""
 
 
+@pytest.mark.slow
 def test_a_completion_states_errors(folder, tmp_path):
     """Those that expected errors of its vertices imply; its report names the model."""
     model, person = small_people(), SyntheticPerson(BodyShape("male", (0.1,)))
@@ -184,6 +187,7 @@ def test_a_completion_states_errors(folder, tmp_path):
     assert abs(float(row["stature"]) - person.anatomy.stature) < 0.01
 
 
+@pytest.mark.slow
 def test_the_body_of_some_measurements(folder, tmp_path, capsys):
     """It has them, and its betas are a subject of other commands."""
     assert scape("-m", folder / "model.npz", "--to", "stature=1.72", "waist=0.82", "-o", tmp_path / "body.ply") == 0
@@ -233,6 +237,7 @@ def test_other_triangles_are_refused(folder, tmp_path, capsys):
     assert "expected the triangles of" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_a_wrong_unit_is_told(folder, tmp_path, capsys):
     """A body of 17 m means nothing."""
     model = small_people()
@@ -241,6 +246,7 @@ def test_a_wrong_unit_is_told(folder, tmp_path, capsys):
     assert "giant: no person measures so, stature" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_a_hole_leaves_a_cell_empty(folder, tmp_path, capsys):
     """The row says why, and no NaN is anywhere."""
     model = small_people()
@@ -257,6 +263,7 @@ def test_a_hole_leaves_a_cell_empty(folder, tmp_path, capsys):
     assert "LOOK AT THE RESULT: open: no calf girth left, a hole" in said, said
 
 
+@pytest.mark.slow
 def test_percentiles_of_a_sex(folder, tmp_path, capsys):
     """The table, the figures and the page compare with the survey; without --sex nothing of it is there."""
     assert scape(folder / "bodies" / "rest.ply", "-m", folder / "model.npz", "--sex", "male", "-o",
@@ -271,6 +278,7 @@ def test_percentiles_of_a_sex(folder, tmp_path, capsys):
     assert f"({ordinal(true['stature'])})" in page and "4,082 men of ANSUR II" in page
 
 
+@pytest.mark.slow
 def test_the_weight_of_a_closed_body_is_told_with_its_error(folder, tmp_path, capsys):
     """985 kg in a cubic metre, give or take 2%; an open one has none, and is good all the same."""
     model = small_people()
@@ -292,6 +300,7 @@ def test_the_weight_of_a_closed_body_is_told_with_its_error(folder, tmp_path, ca
     assert "LOOK AT" not in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_the_most_probable_man_and_what_is_likely_of_him(tmp_path, capsys):
     """The body has what was asked for; of the rest the table, the page, the betas and the report tell the range."""
     assert scape("--to", "stature=1.80", "weight=78", "--sex", "male", "-o", tmp_path / "he.ply") == 0
@@ -306,6 +315,7 @@ def test_the_most_probable_man_and_what_is_likely_of_him(tmp_path, capsys):
     assert "wrist girth left, likely " in (tmp_path / "he.ply.report.json").read_text(encoding="utf-8")
 
 
+@pytest.mark.slow
 def test_nobody_said_the_sex(tmp_path, capsys):
     """The more probable one is taken and told, and how to name it."""
     assert scape("--to", "stature=1.58", "hip=1.05", "-o", tmp_path / "she.ply") == 0
@@ -314,6 +324,7 @@ def test_nobody_said_the_sex(tmp_path, capsys):
     assert json.loads((tmp_path / "she.betas.json").read_text())["sex"] == "female"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("words", "told"), [
     (("waist=0.6", "hip=1.4"), "hip girth 1,400 mm fits least: most women with the other measurements have"),
     (("stature=1.5", "weight=200"), "weight 200.0 kg fits least: most women with the other measurements have"),

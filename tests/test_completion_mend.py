@@ -165,6 +165,7 @@ def test_a_folder_is_mended_in_the_browser_and_the_command_keeps_it(place, new_p
     np.testing.assert_array_equal(kept.completed.vertices, mended.completed.vertices)
 
 
+@pytest.mark.slow
 def test_by_the_command_itself_nothing_is_lost_and_new_scans_can_be_begun(place, monkeypatch):
     """Looked at and left alone; then the scan that came later is completed there, in a folder of its own too."""
     before = json.loads((place / "out" / "report.json").read_text())

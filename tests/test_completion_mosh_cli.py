@@ -100,6 +100,7 @@ def test_held_out_markers_of_a_changing_shape_are_those_of_its_meshes(done, plac
     assert np.abs(held.soft - off).max() < 0.004
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("words", [("--preset", "published"), ("--config", "soft.toml", "--character", "model.npz")])
 def test_betas_may_change_in_every_frame(place, tmp_path, monkeypatch, words):
     """As the paper has it: by its preset, and by the setting alone; every file is there."""
@@ -282,6 +283,7 @@ def test_a_page_plays_no_more_frames_than_it_can_carry(count, rate, step):
     assert frames[1:2].tolist() == [step][:count - 1] and shown == rate / step and len(frames) <= 2000
 
 
+@pytest.mark.slow
 def test_the_model_of_the_sex_that_the_markers_tell(place, tmp_path):
     model = worm_with_prior()
     model.info["sex_plane"] = SexPlane(np.array([1.0, 0, 0]), 0.0, 40, 0.95, 5.0).to_arrays()

@@ -107,6 +107,7 @@ def test_the_body_does_not_shrink_towards_the_mean():
     assert np.linalg.norm(found - true, axis=1).mean() < 0.25 * far
 
 
+@pytest.mark.slow
 def test_betas_are_as_long_as_the_markers_can_tell():
     """People who differ by a millimetre or two, in twelve ways, with markers 10 mm beside their place and 5 mm off the
     skin in every frame alike: the betas found are neither longer nor shorter than what is true of them: the truth is
@@ -328,6 +329,7 @@ def test_left_and_right_exchanged_on_many_markers_are_put_right_together():
     np.testing.assert_array_equal(found.restore_names(markers, layout).positions, data)
 
 
+@pytest.mark.slow
 def test_where_the_body_is_at_fault_no_marker_is_moved():
     order = np.random.default_rng(0).permutation(26)
     markers = MarkerSequence(sequence(displaced()).positions[:, order], LABELS, 60.0)

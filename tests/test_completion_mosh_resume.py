@@ -50,6 +50,7 @@ def copied(place, whole, tmp_path, monkeypatch):
     return tmp_path / "here"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("stage, call, kept", [
     ("solve", 2, {"start"}), ("soft", 1, PERSON | {"poses", "artefacts"}), ("page", 1, ALL - {"page", "person page"}),
     ("person page", 1, ALL - {"person page"})])
@@ -67,6 +68,7 @@ def test_killed_in_the_middle_of_a_recording_it_goes_on(copied, stage, call, kep
     assert not (out / HOME / "making").exists() and not list((out / HOME).rglob(".*"))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("words, settings, anew", [
     ((), {}, set()), ((), {"exaggeration": 1.5}, {"files", "page", "person page"}),
     ((), {"soft": {"reach": 0.12}}, {"soft", "files", "page", "person page"}),
@@ -76,6 +78,7 @@ def test_what_depends_on_a_changed_setting_is_done_anew(copied, words, settings,
     check(copied, anew, words, settings)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("what", ["model", "layout", "recording"])
 def test_what_depends_on_a_changed_file_is_done_anew(copied, what):
     if what == "model":
@@ -120,6 +123,7 @@ def test_workers_of_a_cluster_keep_no_steps_and_write_the_same(copied, monkeypat
     assert not (copied / "cluster" / HOME / "steps").exists()
 
 
+@pytest.mark.slow
 def test_a_recording_less_takes_its_folder_away(place, tmp_path):
     people, out = tmp_path / "people", tmp_path / "out"
     shutil.copytree(place / "people", people)

@@ -127,6 +127,7 @@ def test_limbs_are_drawn_from_the_training_poses(model):
     assert len(examples_of(FixedBody(worm_with_prior().subject(None)), x, 2, 40, np.random.default_rng(0))) == 0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("change", [
     {"correspondences": True}, {"joint_limits": True},
 ], ids=["correspondences", "limits"])

@@ -349,6 +349,7 @@ def unbroken(passing):
     return stream, frames, errors(subject, [*first, *frames], truth[:40]).max()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("wrong", WRONG.values(), ids=WRONG)
 def test_one_frame_that_no_body_makes_is_passed_over(passing, unbroken, wrong):
     (subject, _, truth, positions), (stream, clean, apart) = passing, unbroken
@@ -360,6 +361,7 @@ def test_one_frame_that_no_body_makes_is_passed_over(passing, unbroken, wrong):
         np.testing.assert_array_equal(there.trusted, other.trusted)
 
 
+@pytest.mark.slow
 def test_a_stream_does_not_begin_with_a_frame_that_no_body_makes(passing):
     subject, layout, truth, positions = passing
     broken = positions[:20].copy()
@@ -377,6 +379,7 @@ def test_a_body_far_from_every_frame_is_followed_in_the_end_and_trusts_none(pass
     assert np.isfinite([f.pose for f in frames[-5:]]).all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("wrong", ["times 1000", "half of it"])
 def test_one_frame_that_no_body_makes_leaves_the_others_of_a_sequence(passing, wrong):
     subject, layout, truth, positions = passing

@@ -83,6 +83,7 @@ def test_a_known_body_is_followed_through_a_half_turn(model, known):
     assert max(far) < 0.006
 
 
+@pytest.mark.slow
 def test_a_gap_and_a_jump_are_survived(model, known):
     bodies, frames = known
     frames = [None if 6 <= i < 9 else views for i, views in enumerate(frames)]

@@ -188,6 +188,7 @@ def test_what_is_made_of_frames_does_not_follow_them_again(again, given, files):
     assert not numbers and changed(before, contents(out)) == files
 
 
+@pytest.mark.slow
 def test_a_changed_frame_is_followed_anew_with_those_after_it(again):
     folder, out, numbers = again
     before, path = contents(out), folder / "frames" / "front" / "007.ply"
@@ -258,6 +259,7 @@ def test_a_file_that_cannot_be_read_is_told_again(again, capfd):
         assert numbers == followed and capfd.readouterr().err.count(f"failed: {folder}/frames/back/006.ply: ") == 1
 
 
+@pytest.mark.slow
 def test_landmarks_that_nobody_shares_are_told_and_left_out(recording, tmp_path, capfd):
     folder, _ = recording
     (tmp_path / "marks.json").write_text('{"m6": [0, 0, 0]}')

@@ -148,6 +148,7 @@ def test_a_scan_in_millimetres_is_noted(tmp_path, model):
     assert not app_of(tmp_path, "mm.ply", unit="mm").state().fields["notes"]
 
 
+@pytest.mark.slow
 def test_many_triangles_are_thinned(tmp_path):
     n = 400
     x, y = np.meshgrid(np.linspace(0, 1, n), np.linspace(0, 2, n), indexing="ij")

@@ -172,6 +172,7 @@ def test_each_completion_is_saved_beside_what_is_there(app, files, tmp_path):
             entered(app, what="complete", **wanted)
 
 
+@pytest.mark.slow
 def test_a_set_is_mended_from_the_view(place):  # noqa: F811
     app = app_of(place, "set", "scans/body0.ply")
     one, other = app.state().fields["pages"]["folders"], app.entries[-1]

@@ -171,6 +171,7 @@ def test_sliders_move_the_body_to_what_the_model_says(files, page, model):
     assert not [error for error in page.errors if "ERR_CONNECTION" not in error]
 
 
+@pytest.mark.slow
 def test_two_models_share_their_sliders(files, page, model):
     app = app_of(files, "worm.npz", "short.npz")
     short = load_model(files / "short.npz")
@@ -190,6 +191,7 @@ def test_two_models_share_their_sliders(files, page, model):
     assert not [error for error in page.errors if "ERR_CONNECTION" not in error]
 
 
+@pytest.mark.slow
 def test_a_part_is_dragged_to_where_the_hand_is(files, page):
     app = app_of(files, "worm.npz")
     with Server(app, say=lambda line: None) as server:

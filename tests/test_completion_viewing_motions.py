@@ -76,6 +76,7 @@ def test_a_recording_laid_over_its_motion_tells_residuals(files, tmp_path, model
         assert page.evaluate(here) == before
 
 
+@pytest.mark.slow
 def test_a_motion_plays(files, page, model):
     app = app_of(files, "wave.npz", model=files / "worm.npz")
     motion = Motion.load(files / "wave.npz")

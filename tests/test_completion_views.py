@@ -161,6 +161,7 @@ def test_a_scaled_body_in_metres_is_the_body(model):
     np.testing.assert_allclose(held.vertices(x[:15]), scaled.vertices(x), atol=1e-6)
 
 
+@pytest.mark.slow
 def test_the_unit_is_found_with_the_pose(model, body, views):
     """The same answer whatever the unit is, and right to a few hundredths."""
     points, marks = views[0][0], body.vertices[MARKS]

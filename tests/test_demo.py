@@ -148,6 +148,7 @@ def test_more_of_the_first_component_is_more_volume(demo_folder):
     assert volumes[0] < volumes[1] < volumes[2]
 
 
+@pytest.mark.slow
 def test_range_views_and_cameras_make_a_template(small_demo, tmp_path):
     views = small_demo / "template_scan" / "range_views"
     cameras = json.loads((views / "cameras.json").read_text())
@@ -211,6 +212,7 @@ def test_page_stands_alone(small_demo):
     assert (small_demo / "animation" / "walk.glb").read_bytes()[:4] == b"glTF"
 
 
+@pytest.mark.slow
 def test_every_figure_of_the_page_turns(small_demo, new_page):
     page = new_page(offline=True)
     page.goto((small_demo / "report.html").as_uri())
@@ -221,6 +223,7 @@ def test_every_figure_of_the_page_turns(small_demo, new_page):
     assert not page.errors and len(page.requests) == 1
 
 
+@pytest.mark.slow
 def test_goes_on_where_it_was(small_demo, tmp_path):
     """Without the model and the page, a second run makes these again, the same, and touches nothing before them."""
     folder = tmp_path / "again"
@@ -265,6 +268,7 @@ def counted():
         yield calls
 
 
+@pytest.mark.slow
 def test_another_setting_does_anew_what_depends_on_it(small_demo, tmp_path, counted):
     """Another rate of the markers: another recording and another motion, and nothing else."""
     folder = tmp_path / "again"
@@ -288,6 +292,7 @@ def scans(folder, config):
         return [s.name for s in Demo(space, config, console.bar).scans]
 
 
+@pytest.mark.slow
 def test_fewer_scans_of_another_person_leave_no_old_one(tmp_path):
     scans(tmp_path / "a", TINY)
     other = replace(TINY, poses=2, subjects=1, seed=3)

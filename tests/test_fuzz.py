@@ -32,6 +32,7 @@ from scanprep.geometry.landmarks import read_landmark_vertices
 from scanprep.skeleton.tree import Skeleton
 
 
+@pytest.mark.slow
 def test_damaged_files_of_every_kind():
     count = os.environ.get("SCAPEKIT_FUZZ", "1500")
     ran = subprocess.run([sys.executable, Path(__file__).with_name("fuzz.py"), "--count", count], capture_output=True,

@@ -106,6 +106,7 @@ GOOD = {"a scan": REGISTER.format("good"), "with landmarks": REGISTER.format("go
         "to align": "prep align good.ply template.ply -o out.ply"}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", NOTHING)
 def test_a_command_says_that_its_result_means_nothing(place, capsys, case):
     command, words = NOTHING[case]
@@ -130,12 +131,14 @@ def test_another_unit_is_refused_before_the_search(place, tmp_path, capsys):
         complete_files(work, CompletionInputs((Path("half.ply"),)), TaskContext(tmp_path / "out"))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", GOOD)
 def test_good_results_stay_good(place, capsys, case):
     assert main(GOOD[case].split()) == 0
     assert "MEANS NOTHING" not in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_a_scan_of_something_else_is_a_failure_of_a_set(place, capsys):
     Path("scans").mkdir()
     for name in ("ten", "good"):
@@ -151,6 +154,7 @@ def test_a_scan_of_something_else_is_a_failure_of_a_set(place, capsys):
     assert "nan" not in Path("set/registration.csv").read_text() and "none" in Path("set/registration.csv").read_text()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("scan", "words"), [("half", None), ("ball", ["explains", "a scan of something else"])])
 def test_completions(place, tmp_path, scan, words):
     model = worm_with_prior()
@@ -177,6 +181,7 @@ def walk(layout, scale=1.0):
     return MarkerSequence(scale * positions, layout.labels, 30.0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("case", "words"), [
     ("good", None), ("inch", ["--unit"]), ("tenth", ["--unit", "0.1"]), ("shuffled", ["another layout"]),
     ("mirrored", ["left and right"])])
@@ -463,6 +468,7 @@ def test_bodies_beyond_what_people_are(stature, volume, betas, verdict, word):
     assert found.verdict == verdict and word in found.why, found
 
 
+@pytest.mark.slow
 def test_betas_that_somebody_typed_are_the_cause_of_the_body_that_they_make():
     model = small_people()
     found = person_judgement(model, np.array([20.0]), ASKED)

@@ -31,6 +31,7 @@ def model(herd, skeleton):
     return learn_scape(*herd[:3], skeleton, CONFIG)
 
 
+@pytest.mark.slow
 def test_the_animals_are_what_they_should_be(herd):
     """Closed bodies off every axis and without symmetry; poses keep bones long; rest is rest."""
     mesh, first = herd[0], Animal()
@@ -47,6 +48,7 @@ def test_the_animals_are_what_they_should_be(herd):
     np.testing.assert_allclose(first.posed(turned), (mesh.vertices - joint) @ R.T + joint, atol=0.02)
 
 
+@pytest.mark.slow
 def test_the_skeleton_is_found(herd, skeleton):
     """Barrel, neck and legs: parts lie within true parts, and the joints of the legs where they are."""
     mesh, _, _, size = herd
@@ -58,6 +60,7 @@ def test_the_skeleton_is_found(herd, skeleton):
         assert np.linalg.norm(skeleton.joints - truth.joints[j], axis=1).min() < 0.04 * size
 
 
+@pytest.mark.slow
 def test_new_poses_and_new_animals_are_met(herd, model):
     size, rng, first = herd[3], np.random.default_rng(1), Animal()
     own = [fit_pose(model.subject(), first.posed(random_pose(rng))).mean for _ in range(3)]

@@ -32,6 +32,7 @@ def crab_model(body, skeleton):
     return learn_scape(body, np.stack([body.vertices, *(bent(body, *t) for t in turns)]), None, skeleton, QUICK.learn)
 
 
+@pytest.mark.slow
 def test_a_scan_that_plain_registration_gets_wrong_is_right_with_the_model(body, crab_model):
     truth = bent(body, *FAR)
     scan = scan_of(body, truth)
@@ -48,6 +49,7 @@ def test_without_any_start_or_landmark_the_pose_is_found(body, crab_model):
     assert mean_mm(found.mesh.vertices, truth) < 4 and found.starts > 1
 
 
+@pytest.mark.slow
 def test_a_good_registration_stays_on_the_data(body, crab_model):
     """The body has a bump that the model does not know; it is there where it was scanned."""
     bump = np.exp(-((body.vertices[:, 0] - 0.05) / 0.05) ** 2)[:, None] * 0.01 * body.vertex_normals

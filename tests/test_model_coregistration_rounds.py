@@ -54,18 +54,26 @@ def test_the_person_with_most_scans_teaches_poses_and_others_shapes(monkeypatch)
 
 
 @pytest.fixture(scope="module")
-def story(body, skeleton, tmp_path_factory):
-    """A poor model from near poses; scans of which plain registration fails on two; what became of them."""
+def begun(body, skeleton):
+    """A poor model from near poses, and scans of which plain registration fails on two."""
     turns = np.random.default_rng(5).normal(0, 0.25, (3, 2, 3)) * [0.3, 1, 1]
     truths = np.stack([*(bent(body, *t) for t in turns), bent(body, *FAR), bent(body, *[-t for t in FAR])])
     scans = [scan_of(body, truth, seed=i) for i, truth in enumerate(truths)]
     plain = np.stack([register(body, scan, config=PLAIN).mesh.vertices for scan in scans])
     first = learn_scape(body, np.stack([body.vertices, *plain[:3]]), None, skeleton, QUICK.learn)
+    return truths, scans, plain, first
+
+
+@pytest.fixture(scope="module")
+def story(begun, tmp_path_factory):
+    """What became of them."""
+    truths, scans, plain, first = begun
     with workspace(tmp_path_factory.mktemp("story") / "kept") as space:
         done = coregister(first, scans, None, COARSE, list(plain), space=space)
     return truths, scans, plain, first, done, space.folder
 
 
+@pytest.mark.slow
 def test_rounds_mend_what_failed_and_better_the_model(story, body):
     truths, _, plain, _, done, _ = story
     before = np.array([mean_mm(v, t) for v, t in zip(plain, truths, strict=True)])
@@ -79,6 +87,7 @@ def test_rounds_mend_what_failed_and_better_the_model(story, body):
     assert done.model.info["poses"] == 6 and not done.failures
 
 
+@pytest.mark.slow
 def test_a_settled_folder_stops_early_and_reports_it(story):
     _, scans, _, _, done, _ = story
     again = coregister(done.model, scans[:2], None, replace(COARSE, tolerance=0.02, rounds=4),
@@ -99,6 +108,7 @@ def asked(monkeypatch):
     return calls
 
 
+@pytest.mark.slow
 def test_what_was_kept_is_not_made_again(story, tmp_path, monkeypatch):
     _, scans, plain, first, done, kept = story
     shutil.copytree(kept, tmp_path / "kept")
@@ -129,6 +139,7 @@ CHANGES = {          # what is changed -> scans that are made anew in the first 
     "what fails": ("", 0), "learning": ("", 5), "more rounds": ("", 5)}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("what", CHANGES)
 def test_only_what_depends_on_a_change_is_made_anew(story, asked, tmp_path, what):
     _, scans, plain, first, _, _ = story
@@ -160,6 +171,7 @@ def test_only_what_depends_on_a_change_is_made_anew(story, asked, tmp_path, what
     assert again.good.all() and before.good.all()
 
 
+@pytest.mark.slow
 def test_a_scan_that_cannot_be_registered_stops_no_other(story):
     _, scans, plain, first, _, _ = story
     spoilt = [*scans[:2], np.full((40, 3), np.nan)]
@@ -173,9 +185,9 @@ def test_a_scan_that_cannot_be_registered_stops_no_other(story):
 
 
 @pytest.fixture(scope="module")
-def folders(story, body, tmp_path_factory):
+def folders(begun, body, tmp_path_factory):
     """A model, a folder of two scans and a broken one, earlier registrations, and what came of it undisturbed."""
-    truths, _, plain, first, _, _ = story
+    truths, _, plain, first = begun
     folder = tmp_path_factory.mktemp("folders")
     marks = {"left": int(np.argmin(body.vertices[:, 0])), "right": int(np.argmax(body.vertices[:, 0])),
              "top": int(np.argmax(body.vertices[:, 1]))}
@@ -194,8 +206,8 @@ def coregister_quickly(folder, output, workers):
                                str(folder / "first.npz"), str(folder / "scans")])
 
 
-def test_command_writes_a_set_and_a_model(story, folders):
-    truths = story[0]
+def test_command_writes_a_set_and_a_model(begun, folders):
+    truths = begun[0]
     told = json.loads((folders / "whole" / "report.json").read_text())
     assert len(told["failures"]) == 1 and "broken.ply" in told["failures"][0]
     assert told["metrics"][0] == {"metric": "scans registered", "value": "2 of 2", "unit": ""}
@@ -207,6 +219,7 @@ def test_command_writes_a_set_and_a_model(story, folders):
     assert [row["name"] for row in rows] == ["s0", "s4"] and float(rows[1]["explained"]) > 0.95
 
 
+@pytest.mark.slow
 def test_killed_with_one_worker_and_started_again_with_one(folders, tmp_path, capfd):
     """Two workers have made the same bytes before."""
     program = [sys.executable, str(Path(__file__).with_name("coregistered.py")), "--first", str(folders / "set"),
@@ -228,6 +241,7 @@ def test_killed_with_one_worker_and_started_again_with_one(folders, tmp_path, ca
     assert tree(tmp_path / "out", "report.json") == tree(folders / "whole", "report.json")
 
 
+@pytest.mark.slow
 def test_what_others_put_into_the_output_stays(folders, tmp_path, capfd):
     (tmp_path / "meshes").mkdir()
     (tmp_path / "meshes" / "s0.ply").write_text("mine")

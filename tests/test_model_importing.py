@@ -67,6 +67,7 @@ def test_a_change_of_the_joints_is_noticed(both):
     assert Digests().of(model) != Digests().of(other)
 
 
+@pytest.mark.slow
 def test_derivatives_match_differences(both):
     _, model = both
     (pose,), (betas,), (trans,) = drawn(model, 1, 3)

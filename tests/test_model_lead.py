@@ -44,6 +44,7 @@ def near(scan):
     return scan.vertices + 0.01 * np.sin(20 * scan.vertices[:, ::-1])
 
 
+@pytest.mark.slow
 def test_a_registration_begins_at_vertices(body, scan):
     found = register(body, scan, config=small(), start=near(scan))
     assert off(found.mesh.vertices, scan.vertices) < 0.008 < off(near(scan), scan.vertices)
@@ -73,6 +74,7 @@ def test_what_leaves_less_to_doubt_is_kept(body, scan, far):
     assert weigh_doubts(body, None, led.fit) == 0 and max(asked) < 100
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("far", [0.0, 4e6])
 def test_two_bodies_that_explain_a_scan_alike_are_both_kept(far):
     """An egg looks the same when it is turned round; something beside it leaves as much to doubt of both."""
@@ -164,6 +166,7 @@ def test_a_person_is_found_in_any_pose_and_lands_on_the_scan(tmp_path):
     assert off(read_mesh(tmp_path / "found.ply").vertices, truth) < 0.01
 
 
+@pytest.mark.slow
 def test_what_is_no_person_is_not_searched_for_limbs(monkeypatch):
     """A template of an animal waited half a minute for limbs that it does not have; a person is found."""
     monkeypatch.setattr(search, "_solve_with_limbs", lambda *given: pytest.fail("limbs were searched"))

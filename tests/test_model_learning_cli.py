@@ -112,6 +112,7 @@ def test_sexes_of_a_plain_folder_come_from_a_table(folder, tmp_path):
         learned(folder / "poses", tmp_path / "n.npz", folder / "people", skeleton=folder / "skeleton.json", by_sex=True)
 
 
+@pytest.mark.slow
 def test_a_mix_takes_every_mesh_of_the_set(folder, tmp_path):
     learned(folder / "set", tmp_path / "mix.npz", kind="mixed", mixed=replace(MIX, refinements=1, components=4))
     model = load_model(tmp_path / "mix.npz")

@@ -117,6 +117,7 @@ def anew(counted, since):
     return {stage: calls - since[stage] for stage, calls in counted.items() if calls > since[stage]}
 
 
+@pytest.mark.slow
 def test_killed_and_started_again_it_goes_on_and_ends_with_the_same_bytes(bodies, counted):
     undisturbed = learned(bodies, "a.npz")
     assert counted == {**ALL, "skeleton": 0}
@@ -176,6 +177,7 @@ def test_the_search_for_a_skeleton_goes_on(tmp_path, monkeypatch):
     assert tried and all(wanted is not None for wanted in tried)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("more, done", [
     ([], {"pictures": 1}),
     (["--landmarks"], {"pictures": 1}),
@@ -196,6 +198,7 @@ def test_a_setting_that_changes(bodies, searched, counted, more, done):
     assert found == learned(bodies, "fresh.npz", *more, **settings)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("file, done", [
     ("poses/pose3.ply", ALL), ("people/person3.ply", {"people": 6, "components": 1, "pictures": 1})])
 def test_a_mesh_that_changes(bodies, searched, counted, file, done):
@@ -207,6 +210,7 @@ def test_a_mesh_that_changes(bodies, searched, counted, file, done):
     assert found == learned(bodies, "fresh.npz", search=True)
 
 
+@pytest.mark.slow
 def test_a_person_that_changes_while_learning_is_interrupted(bodies, counted):
     killed(scape, "learn_shape_space", 0, words(bodies, "m.npz"))
     moved(bodies / "people/person3.ply")

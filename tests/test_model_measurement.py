@@ -152,6 +152,7 @@ def test_no_chest_takes_an_arm_along():
         assert found.value == pytest.approx(told, rel=0.065)
 
 
+@pytest.mark.slow
 def test_girths_are_those_of_the_surface_itself():
     """An implicit surface, cut without any triangles; plain polygons are 1.2 mm too short."""
     figure, corners = cartoon("beanpole", 0.006), []
@@ -216,6 +217,7 @@ def test_place_turn_and_size_change_nothing_else(person, tapes):
         assert larger[name] == pytest.approx(1.1**(3 if name == "weight" else 1) * value, rel=2e-3), name
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("smooth", [False, True])
 def test_derivatives_are_finite_differences(person, tapes, smooth, monkeypatch):
     """Exact on plain triangles, but for ways that change theirs; of the smooth tape turning normals are left out."""

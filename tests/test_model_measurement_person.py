@@ -70,6 +70,7 @@ def measure_in_pose(standing, vertices) -> Measurements:
     return measure_person(vertices, tapes, standing, tapes.axes, np.full(len(vertices), 0.002))
 
 
+@pytest.mark.slow
 def test_bodies_of_other_triangles_are_measured_standing(standing):
     """Heights, trunk and knees as on the body at rest, with larger errors; a calf as it is."""
     laid, bent = standing
@@ -84,6 +85,7 @@ def test_bodies_of_other_triangles_are_measured_standing(standing):
     assert np.abs(posed.body - laid.template.vertices).max() < 0.03
 
 
+@pytest.mark.slow
 def test_a_pose_that_is_that_of_the_template_adds_no_error(standing):
     laid, tapes = standing[0], people_tapes(standing[0])
     vertices, error = laid.template.vertices, np.full(len(laid.template.vertices), 0.002)
@@ -92,6 +94,7 @@ def test_a_pose_that_is_that_of_the_template_adds_no_error(standing):
         assert value == pytest.approx(plain.errors[name], rel=0.15), name
 
 
+@pytest.mark.slow
 def test_measures_of_people_are_plausible_and_misplaced_tapes_are_not():
     for sex, weight in (("male", 0.0), ("female", 2.5), ("male", 3.0), ("female", -1.5)):
         mesh = SyntheticPerson(BodyShape.like(sex, weight=weight)).mesh

@@ -40,6 +40,7 @@ def strangers(truth):
     return mix(truth, 5, 1, 1)[0]
 
 
+@pytest.mark.slow
 def test_a_mixed_truth_comes_back(truth, learned, strangers):
     """About as well as from as many bodies, half of them one person's poses and half other people near rest."""
     rng = np.random.default_rng(2)

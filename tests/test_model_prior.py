@@ -64,6 +64,7 @@ def test_without_a_prior_one_scan_is_refused(known):
         learn_scape(known.template, known.template.vertices[None], None, known.skeleton, CONFIG)
 
 
+@pytest.mark.slow
 def test_few_scans_gain_and_many_have_their_own_way(known, other):
     """The prior is of other flesh. With three poses it helps against nothing known; with sixty it changes little."""
     prior, errors = prior_of(known), {}
@@ -182,6 +183,7 @@ def test_a_model_file_is_the_prior_of_a_command(known, tmp_path, capsys):
     assert "expected at least 3, got 1" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_a_model_of_something_else_is_refused_by_name_and_left_out_by_itself(known, tmp_path, monkeypatch, capsys):
     """The built-in people asked for on a worm; and on a template that has limbs and is no person after all."""
     def does_not_lie(*_given):

@@ -40,6 +40,7 @@ def test_without_a_sex_half_are_women_and_nobody_is_in_between(model):
         assert np.abs(np.log(mine.std(axis=0) / sds)).max() < 0.1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("sex", SEXES)
 def test_drawn_bodies_are_as_tall_and_as_heavy_as_people(model, sex):
     drawn = sample_bodies(model, 150, np.random.default_rng(3), sex=sex)

@@ -118,6 +118,7 @@ def test_the_texture_has_the_colours_of_the_scan(made):
     assert np.median(np.abs(off)) < 0.01                                 # the control mesh is near, not on, the skin
 
 
+@pytest.mark.slow
 def test_reconstruction_at_every_level_is_closed(made, tmp_path):
     counts = []
     for level in (0, 2):
@@ -132,6 +133,7 @@ def test_reconstruction_at_every_level_is_closed(made, tmp_path):
     assert run("reconstruct", made / "statue", "-o", tmp_path / "skinned.glb") == 0
 
 
+@pytest.mark.slow
 def test_an_edited_image_moves_the_surface_there_and_nowhere_else(made, tmp_path):
     about = json.loads((made / "statue" / "displacement.json").read_text())
     image = np.array(Image.open(made / "statue" / "displacement.png"))

@@ -133,6 +133,7 @@ def fine_map(control, scan):
     return bake_displacement(control, scan, DisplacementConfig(size=768))
 
 
+@pytest.mark.slow
 def test_both_ways_to_the_map_agree(control, scan, fine_map):
     """Heights of scan vertices by the cubic, and of pixels at the same place by rays."""
     points = scan.vertices[1:-1:97]                          # without the poles, where the seam ends and normals kink
@@ -237,6 +238,7 @@ def test_vectors_mend_an_overhang_and_nothing_else(control, with_vectors):
     assert far[0] > 0.002 and far[1] < 0.6 * far[0]
 
 
+@pytest.mark.slow
 def test_a_control_mesh_that_is_folded_inside_the_scan_is_drawn_out(control, scan):
     near = np.linalg.norm(control.mesh.vertices - [0, R, 0], axis=1) < 0.35 * R
     dented = replace(control, mesh=control.mesh.with_vertices(

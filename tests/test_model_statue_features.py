@@ -251,6 +251,7 @@ def test_the_unit_is_told_by_the_height(length, unit):
     assert guess_person_unit(points) == unit
 
 
+@pytest.mark.slow
 def test_a_person_is_found_upside_down_in_millimetres_with_holes_and_without_an_arm(control):
     person = SyntheticPerson(BodyShape.like("female", stature=1.62, weight=1.0))
     pose = compose_pose(left_arm={"direction": (0.8, 0.5, -0.3), "elbow": 40}, back={"turn": 15},

@@ -26,12 +26,16 @@ FEWEST = 20                          # the same of a single module of more than 
 
 
 @functools.cache
+def tree_of(path):
+    return ast.parse(path.read_text(encoding="utf-8"))
+
+
+@functools.cache
 def lines_of(path):
     """Lines of a module, and the kind of each: code, comment, doc, import or blank."""
-    source = path.read_text(encoding="utf-8")
-    lines = source.splitlines()
+    lines = path.read_text(encoding="utf-8").splitlines()
     kinds = ["blank" if not line.strip() else "comment" if line.strip().startswith("#") else "code" for line in lines]
-    for node in ast.walk(ast.parse(source)):
+    for node in ast.walk(tree_of(path)):
         if isinstance(node, ast.Import | ast.ImportFrom):
             kinds[node.lineno - 1:node.end_lineno] = ["import"] * (node.end_lineno - node.lineno + 1)
         elif isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant) and isinstance(node.value.value, str):
@@ -46,9 +50,9 @@ def comments_of(path):
     return kinds.count("comment") + trailing, kinds.count("code")
 
 
+@functools.cache
 def functions(path):
-    tree = ast.parse(path.read_text(encoding="utf-8"))
-    return [node for node in ast.walk(tree) if isinstance(node, ast.FunctionDef)]
+    return [node for node in ast.walk(tree_of(path)) if isinstance(node, ast.FunctionDef)]
 
 
 def is_participle(name):

@@ -73,6 +73,7 @@ def test_fit_of_views_knows_right_from_wrong(views):
     assert conflict.max() > 0.03
 
 
+@pytest.mark.slow
 def test_shapes_alone_bring_views_together(views):
     views = [views[k] for k in (0, 1, 2)]
     lost, frames = moved(views, np.random.default_rng(3))

@@ -282,6 +282,7 @@ def test_a_second_run_is_told_and_leaves(tmp_path):
     assert not (tmp_path / "out").exists()                       # neither of them did anything
 
 
+@pytest.mark.slow
 def test_workers_go_when_the_run_is_killed(tmp_path):
     code = ("import sys\nfrom pathlib import Path\nfrom scanprep.batch.pool import Workers, run_jobs\n"
             "from scanprep.batch.room import Job\n"

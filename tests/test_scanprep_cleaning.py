@@ -72,6 +72,7 @@ def scene(person):
     return whole, np.repeat(np.arange(4), [len(p.vertices) for p in parts])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["mesh", "points"])
 def test_the_person_is_left_with_the_soles(scene, person, kind):
     mesh, whose = scene
@@ -90,6 +91,7 @@ def test_the_person_is_left_with_the_soles(scene, person, kind):
     assert len(clean.mesh.vertices) == pytest.approx(clean.kept.sum(), rel=5e-3)      # loose points have no triangle
 
 
+@pytest.mark.slow
 def test_every_piece_is_accounted_for(scene):
     mesh, whose = scene
     clean = clean_scan(mesh)
@@ -107,6 +109,7 @@ def test_every_piece_is_accounted_for(scene):
     assert [row.kept for row in rows[:4]] == [False, True, False, False]
 
 
+@pytest.mark.slow
 def test_the_frame_does_not_matter(scene):
     mesh, _ = scene
     R = rotations.exp(np.array([0.9, -0.4, 1.7]))
@@ -135,6 +138,7 @@ def test_floor_and_wall_go_and_the_floor_is_the_one_stood_on(scene):
     assert not clean.kept[len(whose):].any() and clean.kept[:len(whose)][whose == 0].mean() > 0.999
 
 
+@pytest.mark.slow
 def test_landmarks_say_which_piece_is_the_body(person):
     large = moved(ball(5, 1.5), [4, 0, 0])
     both = joined(person, large)
@@ -263,6 +267,7 @@ def plinth(width, height, closed, spacing=0.008):
             *(moved(side, R @ [0, 0, width / 2] - [0, 0, height / 2], R) for R in upright)]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("width", "height", "goes"), [(0.6, 0.3, True), (0.7, 1.0, False)])
 def test_a_pedestal_goes_with_its_top_or_is_doubted(width, height, goes):
     """It was kept and called good; as high as a seat it might be part of somebody who sits."""

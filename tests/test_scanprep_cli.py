@@ -112,6 +112,7 @@ def test_run(place, tmp_path, capsys, quick):
     assert page.index("scan-broken") and page.count("<figure data-scene=") == 3
 
 
+@pytest.mark.slow
 def test_the_published_preset_registers_a_folder(place, tmp_path, monkeypatch):
     """With a tenth of its nodes and rounds."""
     paper = RegistrationConfig.from_paper()

@@ -79,11 +79,13 @@ def test_five_seeds_on_overlapping_sheets_become_many_pairs(found, kicking):
     assert (np.diff(found.confidence) <= 0).all()
 
 
+@pytest.mark.slow
 def test_doubtful_pairs_are_worse(found, kicking):
     error = apart(found, kicking)
     assert error[:40].mean() < error[40:].mean()
 
 
+@pytest.mark.slow
 def test_the_scan_may_stand_anywhere(person, kicking, ends, found):
     R, t = rotations.exp(np.array([0.3, -2.0, 1.1])), np.array([3.0, -1.0, 0.5])
     scan = sheets(kicking, np.random.default_rng(0))
@@ -94,6 +96,7 @@ def test_the_scan_may_stand_anywhere(person, kicking, ends, found):
     assert np.median(error) < 0.02 and (error > 0.1).mean() <= 0.03
 
 
+@pytest.mark.slow
 def test_the_scan_may_be_larger(person, kicking, ends, found):
     large = kicking.with_vertices(1.25 * kicking.vertices)
     again = find_correspondences(person.mesh, dense(large), (ends, large.vertices[ends]), SMALL)
@@ -113,6 +116,7 @@ def test_wrong_seeds_are_refused(person, kicking):
         find_correspondences(mesh, kicking, (np.array([0, 1, 2]), np.full((3, 3), np.nan)))
 
 
+@pytest.mark.slow
 def test_seeds_are_found_without_a_click_and_not_swapped(person, kicking, ends):
     seeds = find_seeds(person.mesh, sheets(kicking, np.random.default_rng(1)), hypotheses=6)
     assert len(seeds) == 5 and seeds.converged

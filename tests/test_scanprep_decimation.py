@@ -229,6 +229,7 @@ def test_a_missing_library_is_named(library, monkeypatch):
         decimate(bumpy(3), 100, DecimateConfig(library))
 
 
+@pytest.mark.slow
 def test_views_become_a_template():
     shape = bumpy(5)
     rng = np.random.default_rng(0)

@@ -227,6 +227,7 @@ def test_correspondences_lead_where_there_are_no_landmarks(scans, template, tmp_
     assert np.linalg.norm(found - turned.vertices, axis=1).max() < 0.05
 
 
+@pytest.mark.slow
 def test_a_model_leads_where_there_are_no_landmarks_or_few(scans, template, tmp_path, monkeypatch):
     """It is laid on the template once; asked for by name it also leads scans with few landmarks."""
     asked, lead = [], ModelLead("balls", np.zeros((642, 3), dtype=np.int64), np.ones((642, 3)) / 3, np.zeros(642))
@@ -311,6 +312,7 @@ def test_a_table_that_was_corrected_registers_nothing_anew(scans, template, tmp_
     assert done.fresh == 0 and done.registered.entries[0].subject == "zoe"
 
 
+@pytest.mark.slow
 def test_what_the_user_put_there_is_left_alone(scans, template, tmp_path):
     whole = contents(scans)
     with pytest.raises(ForeignFileError, match="nothing was touched"):

@@ -134,6 +134,7 @@ def apart_mm(tmp_path, truth):
             for e in entries}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("scale", [1.0, pytest.param(0.2, marks=pytest.mark.slow)])
 def test_doubted_and_failed_scans_are_registered_through_what_the_others_teach(tmp_path, body, truth, calls, done,
                                                                                scale):
@@ -180,6 +181,7 @@ def test_scans_of_other_calls_keep_what_later_rounds_found(tmp_path, body, truth
     assert max(apart_mm(tmp_path, truth).values()) < 40
 
 
+@pytest.mark.slow
 def test_scans_that_no_model_finds_keep_their_reasons_and_the_others_their_place(tmp_path, body, truth, calls,
                                                                                  monkeypatch):
     first = one_scan.register_by_any
@@ -197,6 +199,7 @@ def test_scans_that_no_model_finds_keep_their_reasons_and_the_others_their_place
     assert len(RegisteredSet.load(tmp_path / "set").entries) == 6
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("subject", "through"), [("", "auto"), pytest.param("crab", "none", marks=pytest.mark.slow)])
 def test_nothing_is_learned_from_one_pose_of_each_or_where_no_model_is_wanted(tmp_path, body, truth, calls, subject,
                                                                               through):

@@ -170,6 +170,7 @@ def test_new_landmark_files_lie_where_the_run_reads_them(place):
     assert app._load_clicked(task, ".pp").file == place / "marks" / "body2.pp"
 
 
+@pytest.mark.slow
 def test_a_set_is_mended_in_the_browser(new_page, place):
     """The wrong landmarks are taken away by key, the scan is registered again by a button: all is new."""
     app = MendApp(place / "set", ENDING)

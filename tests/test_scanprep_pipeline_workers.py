@@ -58,6 +58,7 @@ def finished(folder):
     return [p.name.removeprefix("scans%2F").removesuffix(".npz") for p in (folder / HOME / "done").glob("scans*.npz")]
 
 
+@pytest.mark.slow
 def test_processes_change_nothing(six, template, tmp_path):
     scans, whole = six
     two = dataclasses.replace(WITH_PICTURES, workers=Workers(2))

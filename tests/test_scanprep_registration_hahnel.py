@@ -4,6 +4,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+import pytest
 from jointed_bodies import bent, crab
 
 from scanprep.geometry import rotations
@@ -70,6 +71,7 @@ def test_a_finer_graph_goes_on_from_the_coarser_one():
     assert off(after, wanted) < off(fit, wanted) + 0.002
 
 
+@pytest.mark.slow
 def test_the_published_registration_bends_the_body_too():
     stages = RegistrationConfig.from_paper().graph
     assert [stage.stretch for stage in stages] == sorted((stage.stretch for stage in stages), reverse=True)

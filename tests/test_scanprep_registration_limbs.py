@@ -49,6 +49,7 @@ def test_angles_are_those_that_a_joint_was_given(person):
     assert np.allclose(angles, wanted, atol=1e-9)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", NAMED_POSES[::7])
 def test_what_people_do_is_not_doubted(person, parts, name):
     turned = person.in_pose(find_pose(name)) @ rotations.exp(np.array([0.3, -2.0, 0.5])).T

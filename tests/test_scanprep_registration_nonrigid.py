@@ -88,6 +88,7 @@ def test_moves_and_scales_with_the_input(truth):
     assert np.abs((moved - t) @ R / s - first).mean() < 1e-3
 
 
+@pytest.mark.slow
 def test_another_size_is_followed():
     body = crab()
     wanted = body.vertices * [1.2, 1.15, 1.1]

@@ -74,6 +74,7 @@ def test_rolls_are_the_best_of_all():
     assert np.isclose(cost, every[0].min()) and not rolls[thigh]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("part, angle", [*product((FOREARM, SHIN, HEAD), (150, -120))])
 def test_a_rolled_limb_is_asked_to_roll_back(person, parts, part, angle):
     """What hangs on it came along, and needs to roll back as well; all bones lie where they should."""
@@ -128,6 +129,7 @@ def test_a_limb_rolls_about_its_bone_and_nothing_else_moves(person, parts):
     assert np.abs(along).max() < 1e-9 < np.linalg.norm(after.positions - start.positions, axis=1)[part == FOREARM].min()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("part, angle", [(FOREARM, np.pi), (SHIN, 2.5)])
 def test_a_limb_rolled_in_a_registration_is_put_right(person, parts, part, angle):
     body = person.in_pose(find_pose("run"))

@@ -51,6 +51,7 @@ def test_a_hole_in_a_smooth_surface_is_left_to_its_patch(person):
     assert pieces == 0 and same is scan
 
 
+@pytest.mark.slow
 def test_a_fit_that_leaves_what_its_start_covers_is_not_kept(person, monkeypatch):
     """Fingers beside a thigh were drawn to it, though the body that was found lay on the scan."""
     hand = np.linalg.norm(person.vertices - person.vertices[landmarks()["left middle finger"]], axis=1) < 0.1
@@ -89,6 +90,7 @@ def test_a_strip_between_two_borders_closes_a_tube():
     assert (out > 0).all() or (out < 0).all()
 
 
+@pytest.mark.slow
 def test_a_body_on_the_scan_keeps_its_fingers(person):
     size = float(np.sqrt(person.face_areas.sum()))
     scan = person.sample(20_000, np.random.default_rng(0))[0]

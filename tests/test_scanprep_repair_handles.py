@@ -37,6 +37,7 @@ def test_long_handles_stay():
     assert cut_handles(wide) is wide
 
 
+@pytest.mark.slow
 def test_fingers_joined_by_a_bridge_come_apart():
     person = load_topology().mesh
     # two triangles of neighbouring fingers that face each other are joined by a tube of six triangles

@@ -321,6 +321,7 @@ def test_reports_are_of_methods_that_keep_the_mesh():
     assert fill_report(ball(1)).holes == ()
 
 
+@pytest.mark.slow
 @pytest.mark.gl
 @pytest.mark.parametrize(("method", "library"), [("poisson-open3d", "open3d"), ("poisson-pymeshlab", "pymeshlab")])
 def test_poisson_closes_a_ball(method, library):

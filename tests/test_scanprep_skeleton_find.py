@@ -139,12 +139,14 @@ def test_a_body_that_does_not_move_is_one_part(figure: Figure) -> None:
     assert np.allclose(skeleton.joints[0], figure.template.vertices.mean(axis=0), atol=1e-12)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("count", [4, 9])
 def test_an_exact_number_of_parts_is_kept(figure: Figure, poses: np.ndarray, count: int) -> None:
     skeleton = find_skeleton(figure.template, poses, replace(FEW, parts=count))
     assert len(skeleton.parents) == count
 
 
+@pytest.mark.slow
 def test_more_parts_than_can_be_told_apart_give_the_nearest_tree_and_a_reason(figure: Figure, poses: np.ndarray
                                                                               ) -> None:
     skeleton = find_skeleton(figure.template, poses, replace(FEW, parts=200))
@@ -154,6 +156,7 @@ def test_more_parts_than_can_be_told_apart_give_the_nearest_tree_and_a_reason(fi
     assert not any("parts was found" in doubt for doubt in skeleton_doubts(skeleton, len(skeleton.parents)))
 
 
+@pytest.mark.slow
 def test_moving_the_bodies_and_the_template_changes_nothing_but_the_place(
         figure: Figure, poses: np.ndarray, found: Skeleton) -> None:
     rng = np.random.default_rng(7)
@@ -166,6 +169,7 @@ def test_moving_the_bodies_and_the_template_changes_nothing_but_the_place(
     assert np.allclose(skeleton.joints[1:], found.joints[1:] @ R0.T + t0, atol=1e-4)
 
 
+@pytest.mark.slow
 def test_millimetres_give_the_same_parts(figure: Figure, poses: np.ndarray, found: Skeleton) -> None:
     large = figure.template.with_vertices(1000 * figure.template.vertices)
     skeleton = find_skeleton(large, 1000 * poses, FEW)
@@ -173,6 +177,7 @@ def test_millimetres_give_the_same_parts(figure: Figure, poses: np.ndarray, foun
     assert np.allclose(skeleton.joints[part[1:]], 1000 * found.joints[before[1:]], atol=0.1)
 
 
+@pytest.mark.slow
 def test_the_order_of_vertices_and_faces_does_not_matter(
         figure: Figure, poses: np.ndarray, found: Skeleton) -> None:
     rng = np.random.default_rng(8)
@@ -191,6 +196,7 @@ def test_the_same_input_gives_the_same_bytes(figure: Figure, poses: np.ndarray, 
     assert again.part_of_face.tobytes() == found.part_of_face.tobytes()
 
 
+@pytest.mark.slow
 def test_noise_leaves_the_parts(figure: Figure, poses: np.ndarray) -> None:
     noisy = poses + np.random.default_rng(9).normal(0, 0.005, poses.shape)
     part = match(figure, skeleton := find_skeleton(figure.template, noisy, FEW))
@@ -198,6 +204,7 @@ def test_noise_leaves_the_parts(figure: Figure, poses: np.ndarray) -> None:
     assert np.linalg.norm(skeleton.joints[part[1:]] - JOINTS[1:], axis=1).max() < 0.01
 
 
+@pytest.mark.slow
 def test_progress_ends_at_its_total(figure: Figure, poses: np.ndarray) -> None:
     seen: list[tuple[int, int]] = []
     find_skeleton(figure.template, poses, FEW, progress=lambda done, total: seen.append((done, total)))

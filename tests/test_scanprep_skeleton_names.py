@@ -64,6 +64,7 @@ def test_the_limbs_of_a_pair_are_on_two_sides_of_a_body_that_leans(person):
     assert name_parts(mesh, skeleton, find_symmetry(person.mesh)) == person.names
 
 
+@pytest.mark.slow
 def test_the_limbs_of_a_pair_have_the_same_segments(person):
     """An upper arm just short enough for a shoulder on one side alone gave the arms different names."""
     joints = person.joints.copy()
@@ -83,6 +84,7 @@ def test_parts_without_names_are_numbered_and_told(person):
     note_numbered_parts(person.skeleton)
 
 
+@pytest.mark.slow
 def test_coarser_and_finer_trees_are_named(person):
     mesh = person.mesh
 

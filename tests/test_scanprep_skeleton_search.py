@@ -59,6 +59,7 @@ def test_the_plane_of_a_person_is_found_in_any_direction_and_order(seed):
     assert (part[symmetry.partner] == MIRROR_PART[part]).mean() > 0.99
 
 
+@pytest.mark.slow
 def test_a_body_that_stands_crooked_is_judged_in_its_straightest_pose():
     body, bent = SyntheticPerson(), np.zeros((16, 3))
     bent[[4, 5, 10]] = [[0, -1.5, 0.4], [0, 0.8, 0.8], [-1.4, 0, 0]]
@@ -69,6 +70,7 @@ def test_a_body_that_stands_crooked_is_judged_in_its_straightest_pose():
     assert helped.holds and helped.pose == 1 and abs(helped.normal[0]) > 0.999
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("crooked", [False, True])
 def test_a_mirrored_pose_is_that_of_the_other_side(crooked):
     body, bent = SyntheticPerson(), np.zeros((16, 3))
@@ -174,6 +176,7 @@ def test_another_seed_finds_the_same_tree(animal, poses, found):
     assert len(again.skeleton.parents) == 12
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("count", [9, 13])
 def test_as_many_parts_as_asked_for(animal, poses, count):
     skeleton = search_skeleton(animal.mesh, poses, replace(CONFIG, parts=count)).skeleton
@@ -181,6 +184,7 @@ def test_as_many_parts_as_asked_for(animal, poses, count):
     assert set(np.unique(skeleton.part_of_face)) == set(range(count))
 
 
+@pytest.mark.slow
 def test_symmetry_can_be_refused(animal, poses, found):
     free = search_skeleton(animal.mesh, poses, replace(CONFIG, symmetric=False))
     assert not free.symmetric and free.symmetry.holds

@@ -334,6 +334,7 @@ def test_landmarks_and_markers(bodies):
     assert nose[1] == pytest.approx(head[:, 1].min(), abs=0.004), "people face -y"
 
 
+@pytest.mark.slow
 def test_the_poses_of_the_demonstration_are_ones_that_people_do(man):
     """No limb lies so that its registration would be doubted, whatever the seed."""
     poses = [subject_pose(k, np.random.default_rng([seed, 1, k]))[1] for seed in range(6) for k in range(1, 12)]

@@ -125,6 +125,7 @@ def scans(folder, seed, poses, people):
     return [data_set.synthetic_scan(folder, seed, *which, COARSE) for which in data_set.scan_plan(poses, people)]
 
 
+@pytest.mark.slow
 def test_synthetic_scans_are_complete_repeatable_and_resumable(tmp_path):
     first = scans(tmp_path / "a", 3, 2, 2)
     assert [e.sex for e in first[2:]] == ["female", "male"] and len({e.name for e in first}) == 4

@@ -91,6 +91,7 @@ def test_a_landmark_that_lies_off_the_template_is_told(body):
     assert list(far) == ["right middle finger"] and 0.015 < far["right middle finger"] < 0.026
 
 
+@pytest.mark.slow
 def test_a_scan_of_which_much_was_not_seen_is_doubted(body):
     coarse = decimate(body, 5000)
     made = template_of_scan(coarse.submesh(coarse.corners.mean(axis=1)[:, 1] < 0.02)[0], 3000)       # its front alone
@@ -121,6 +122,7 @@ def test_a_cloud_becomes_a_closed_template(body):
     assert any("points without triangles were meshed" in note for note in made.notes)
 
 
+@pytest.mark.slow
 def test_a_cloud_is_open_where_nothing_was_scanned(body):
     pytest.importorskip("open3d")
     points, face, _ = body.sample(24000, np.random.default_rng(2))

@@ -128,6 +128,7 @@ def test_what_is_clicked_while_the_connection_is_lost_arrives_once_and_in_order(
     wait_until(opened, "got.at(-1)[1].clicks === 31")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("arriving", [0, 2, 6])
 def test_what_was_not_acknowledged_is_done_once_whether_it_arrived_or_not(new_page, server, app, arriving):
     page = new_page()
@@ -218,6 +219,7 @@ class Foreign(http.server.SimpleHTTPRequestHandler):
         pass
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("host", ["127.0.0.1", "localhost"])
 def test_another_site_can_neither_connect_nor_store(opened, server, app, host):
     """Another port is the same site, which gets the user's cookie, but another origin."""

@@ -43,6 +43,7 @@ def report(tmp_path_factory):
     return path
 
 
+@pytest.mark.slow
 def test_without_webgl_the_pictures_stay(report):
     with chromium(WITHOUT_3D) as without:
         page = watched(without.new_context(offline=True))
@@ -101,6 +102,7 @@ def test_the_browser_has_the_shapes_that_were_packed(shown, report):
     assert shown.locator(".sk-label").all_inner_texts() == ["left", "right"]
 
 
+@pytest.mark.slow
 def test_legends_are_in_millimetres_and_per_cent(shown):
     legend = shown.locator("figure").first.locator(".sk-legend")
     assert legend.all_inner_texts()[0].split("\n") == ["distance to the scan", "0 mm", "10 mm"]
@@ -131,6 +133,7 @@ def test_names_are_of_what_is_in_sight(shown):
     wait_until(shown, f"!{told}.length")
 
 
+@pytest.mark.slow
 def test_a_name_that_would_leave_the_picture_stands_on_the_other_side(shown):
     pane = "document.querySelector('figure').sk.panes[0]"
     box = f"{pane}.told.find((label) => label.text.startsWith('hand'))"

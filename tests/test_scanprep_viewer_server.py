@@ -148,6 +148,7 @@ def test_clicks_that_wait_at_the_end_are_handled(app):
     assert app.seen == [1, 2, 3]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("ending", [signal.SIGINT, signal.SIGTERM], ids=["Ctrl-C", "SIGTERM"])
 def test_a_signal_ends_serve_cleanly_though_a_job_does_not(tmp_path, ending):
     code = textwrap.dedent("""

@@ -30,7 +30,7 @@ from ..files import BUILT_IN, load_model
 from ..fitting.bodies import as_body
 from ..fitting.scale import BADLY, find_size
 from ..fitting.scan import prepare_scan
-from ..fitting.search import Landmarks, ModelMismatchError, find_bodies, lay_model
+from ..fitting.search import Landmarks, ModelMismatchError, find_bodies, lay_model, nearest_by_name
 from ..fitting.settings import ScanFitConfig
 from ..learning.config import LearnConfig
 from ..learning.scape import learn_scape
@@ -113,10 +113,8 @@ def model_lead(template: Mesh, through: str, progress: Callable[[int, int], None
     place = Surface(laid).closest(template.vertices)
     corners = laid.faces[place.faces]
     off = np.einsum("nd,nd->n", template.vertices - place.points, normals_at(laid, corners, place.bary))
-    named = model.info.get("landmarks") or {}
-    nearest = cKDTree(template.vertices).query(laid.vertices[list(named.values())])[1] if named else ()
     return ModelLead(name, corners, place.bary, off, parts,
-                     {mark: int(v) for mark, v in zip(named, nearest, strict=True)})
+                     nearest_by_name(template, laid, model.info.get("landmarks") or {}))
 
 
 def person_on(scan: Mesh | np.ndarray) -> tuple[Mesh, dict[str, int]] | None:

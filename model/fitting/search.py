@@ -6,9 +6,10 @@
 """
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from scanprep.geometry.mesh import Mesh
 from scanprep.registration.nonrigid import register, share_stretched, share_uncovered
@@ -33,6 +34,12 @@ ALIKE, FAR, LOST = 0.015, 0.045, 0.005
 
 class ModelMismatchError(ValueError):
     """The model does not fit the template: it is of another kind of body."""
+
+
+def nearest_by_name(template: Mesh, laid: Mesh, names: Mapping[str, int]) -> dict[str, int]:
+    """Find the vertices of a template that are nearest to named ones of the model laid on it."""
+    nearest = cKDTree(template.vertices).query(laid.vertices[list(names.values())])[1] if names else ()
+    return {name: int(v) for name, v in zip(names, nearest, strict=True)}
 
 
 def lay_model(model: BodyModel, template: Mesh, progress: Callable[[int, int], None] | None = None) -> Mesh:

@@ -16,7 +16,7 @@ from scipy.spatial import cKDTree
 from scanprep.geometry.mesh import Mesh
 
 from ..body import BodyModel
-from ..fitting.search import lay_model
+from ..fitting.search import lay_model, nearest_by_name
 from ..resolution.transfer import SurfaceCarrier
 from .transfer import own_body
 
@@ -71,10 +71,7 @@ class StandingModel:
 
     def landmarks(self, names: Mapping[str, int]) -> dict[str, int]:
         """Find vertices of the model, by name, on the template: the nearest vertex of each."""
-        if self.laid is None:
-            return dict(names)
-        nearest = cKDTree(self.template.vertices).query(self.laid.vertices[list(names.values())])[1]
-        return {name: int(v) for name, v in zip(names, nearest, strict=True)}
+        return nearest_by_name(self.template, self.laid or self.template, names)
 
     def stand(self, vertices: np.ndarray) -> StandingBody:
         """Bring a registered body (N, 3), metres, into the pose of the model's template, with all its detail."""
