@@ -80,7 +80,7 @@ def test_a_public_name_means_one_thing():
     places = collections.defaultdict(list)
     for path in MODULES:
         if path.name not in COMMANDS:
-            for node in ast.parse(path.read_text(encoding="utf-8")).body:
+            for node in tree_of(path).body:
                 if isinstance(node, ast.FunctionDef | ast.ClassDef) and not node.name.startswith("_"):
                     places[node.name].append(f"{path.relative_to(ROOT)}:{node.lineno}")
     assert not {name: where for name, where in places.items() if len(where) > 1 and name not in REGISTRIES}

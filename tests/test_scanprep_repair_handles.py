@@ -1,11 +1,12 @@
 """Bridges between fingers are cut: a person's surface has no handle."""
 import numpy as np
 import pytest
+from scipy.spatial import cKDTree
 
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.surface import Surface
 from scanprep.repair.handles import count_handles, cut_handles, find_short_loop, measure_loop
-from scanprep.surfaces.template import MadeTemplate
+from scanprep.surfaces.template import MadeTemplate, TemplateConfig, template_of_scan
 from scanprep.synthetic.topology import load_topology
 
 
@@ -37,26 +38,39 @@ def test_long_handles_stay():
     assert cut_handles(wide) is wide
 
 
-@pytest.mark.slow
-def test_fingers_joined_by_a_bridge_come_apart():
+@pytest.fixture(scope="module")
+def joined():
+    """A person of whom two fingers are joined by a tube."""
     person = load_topology().mesh
-    # two triangles of neighbouring fingers that face each other are joined by a tube of six triangles
+    # two triangles that face each other are taken out, and their borders joined by six
     middle, out = person.corners.mean(axis=1), person.face_normals
     hand = np.flatnonzero(middle[:, 0] > 0.88 * middle[:, 0].max())
-    way = middle[hand] - middle[hand][:, None]
-    length = np.linalg.norm(way, axis=2)
-    facing = (out[hand] @ out[hand].T < -0.8) & (np.einsum("ik,ijk->ij", out[hand], way) > 0.8 * length)
-    a, b = hand[list(np.unravel_index(np.where(facing & (length > 0.008), length, 1.0).argmin(), length.shape))]
+    pairs = hand[cKDTree(middle[hand]).query_pairs(0.02, output_type="ndarray")]
+    way = middle[pairs[:, 1]] - middle[pairs[:, 0]]
+    length = np.linalg.norm(way, axis=1)
+    # they face each other across at least 8 mm of air
+    facing = ((out[pairs[:, 0]] * out[pairs[:, 1]]).sum(axis=1) < -0.8) & (length > 0.008)
+    facing &= (out[pairs[:, 0]] * way).sum(axis=1) > 0.8 * length
+    a, b = pairs[np.where(facing, length, 1.0).argmin()]
     one, other = person.faces[a], person.faces[b][::-1]
     other = min((np.roll(other, k) for k in range(3)),
                 key=lambda turned: np.linalg.norm(person.vertices[one] - person.vertices[turned]))
     tube = [side for k in range(3) for side in (
         (one[k], one[(k + 1) % 3], other[k]), (one[(k + 1) % 3], other[(k + 1) % 3], other[k]))]
-    joined = Mesh(person.vertices, np.concatenate([np.delete(person.faces, [a, b], axis=0), tube]))
+    return Mesh(person.vertices, np.concatenate([np.delete(person.faces, [a, b], axis=0), tube]))
+
+
+def test_fingers_joined_by_a_bridge_come_apart(joined):
     assert count_handles(joined) == 1 and joined.is_closed and joined.is_edge_manifold
     apart = cut_handles(joined)
     assert count_handles(apart) == 0
-    assert Surface(apart).closest(person.vertices).distances.max() < 0.005
+    assert Surface(apart).closest(load_topology().mesh.vertices).distances.max() < 0.005
+
+
+@pytest.mark.slow
+def test_a_template_tells_that_a_bridge_was_cut(joined):
+    made = template_of_scan(joined, config=TemplateConfig(thinnest=1e-6))
+    assert any(note.startswith("1 bridge was cut") for note in made.notes) and not made.handles
 
 
 def test_a_template_with_a_handle_is_doubted():

@@ -201,7 +201,11 @@ def _finish(mesh: Mesh, faces: int, config: TemplateConfig, progress: Callable[[
     mesh = close(mesh, config.fill)
     if person is None:                                   # a body that was joined has no other thin parts than people
         mesh = close(drop_thin(mesh, config.thinnest), config.fill)
-    mesh = cut_handles(mesh)
+    joined, mesh = count_handles(mesh), cut_handles(mesh)
+    apart = joined - count_handles(mesh)
+    if apart:
+        notes.append(f"{number_of(apart, 'bridge was', 'bridges were')} cut, or the opening beside it closed, where "
+                     "thin parts such as fingers touch")
     mesh = smooth_taubin(mesh, rounds)
     report_progress(3, 4)
     surface = Surface(mesh)
