@@ -46,6 +46,13 @@ def test_many_small_doubts_need_a_look_together():
     assert not judge(doubts=doubts, limits=Limits(right=0.0)).suspect
 
 
+def test_skin_of_unlike_people_may_be_stretched():
+    """Two people that are true to each other, vertex by vertex, have 5% stretched to the double or half; not 10%."""
+    assert not judge(replace(FINE, stretch=0.053)).suspect
+    why = "10.0% of the surface stretched or shrunk to the double or half"
+    assert judge(replace(FINE, stretch=0.1)).reasons == (why,)
+
+
 def test_of_what_is_no_person_no_probability_is_told():
     assert np.isnan(review([FINE], {}, SIZE, FACES, None, None, 0.1)[0].right)
     assert review([FINE], {"a": "why"}, SIZE, FACES, None, {"a": ()}, 0.1)[0].right == 0

@@ -1,14 +1,18 @@
 """What a scan lacks of a person is grafted from the body that lies on it."""
+from types import SimpleNamespace
+
 import igl
 import numpy as np
 import pytest
+from scanned_shapes import ball
 
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.places import point_areas
 from scanprep.geometry.surface import Surface
+from scanprep.judgement import size
 from scanprep.registration import nonrigid
 from scanprep.registration.matches import Fit
-from scanprep.registration.nonrigid import covers, register
+from scanprep.registration.nonrigid import choose_fit_that_stays, covers, register, share_doubled
 from scanprep.repair.graft import bridge, find_missing, graft, with_islands
 from scanprep.repair.hole_filling import close
 from scanprep.surfaces.template import TemplateConfig, template_of_scan
@@ -65,6 +69,19 @@ def test_a_fit_that_leaves_what_its_start_covers_is_not_kept(person, monkeypatch
         np.testing.assert_allclose(fit.mesh.vertices, kept, atol=1e-6)
 
 
+def test_a_fit_that_fuses_two_fingers_is_not_kept():
+    """The scan lacks one finger, here a ball: without data it slides into its neighbour, and all of the scan is covered."""
+    one = ball(3)
+    both = Mesh(np.concatenate([one.vertices, one.vertices + [0.3, 0, 0]]),
+                np.concatenate([one.faces, one.faces + len(one.vertices)]))
+    second = np.arange(len(both.vertices)) >= len(one.vertices)
+    fused, touching = (both.with_vertices(both.vertices - second[:, None] * [by, 0, 0]) for by in (0.3, 0.1))
+    assert (share_doubled(both, both), share_doubled(both, touching), share_doubled(both, fused)) == (0, 0, 1)
+    inputs = SimpleNamespace(template=both, size=size(both))
+    kept = choose_fit_that_stays(inputs, both.vertices, one, [lambda: Fit(fused.vertices), lambda: Fit(both.vertices)])
+    assert kept.x is both.vertices
+
+
 @pytest.mark.slow
 def test_a_template_has_the_fingers_that_its_scan_lacks(person, without_a_finger_tip):
     scan, tip = without_a_finger_tip
@@ -92,15 +109,14 @@ def test_a_strip_between_two_borders_closes_a_tube():
 
 @pytest.mark.slow
 def test_a_body_on_the_scan_keeps_its_fingers(person):
-    size = float(np.sqrt(person.face_areas.sum()))
     scan = person.sample(20_000, np.random.default_rng(0))[0]
     fit = register(person, scan, start=person.vertices)
-    assert covers(person, scan, size)
+    assert covers(person, scan, size(person))
     tips = person.vertices[[landmarks()[f"{side} middle finger"] for side in ("left", "right")]]
     # the points are 10 mm apart
     assert Surface(fit.mesh).closest(tips).distances.max() < 0.010
     # a body beside the scan is brought there by the graph first
-    assert not covers(person, scan + [0, 0.05, 0], size)
+    assert not covers(person, scan + [0, 0.05, 0], size(person))
 
 
 def test_shares_of_a_surface_do_not_depend_on_how_densely_it_was_sampled(person):

@@ -23,8 +23,8 @@ NONE = "none"                  # what a table says where a figure has no value
 # Fitted by `fit_weights` of tests/benchmarks/reliability.py on 72 scans. Fitted on one half and tested on the other,
 # the Brier score is 0.16; a constant guess has 0.22. Inverted triangles were too rare to fit, so their weight stays
 # 0.5.
-WEIGHTS = {"certain": 1.61, "missed": 0.77, "distance": 0.53, "unseen": 2.51, "stretch": 0.51, "inverted": 0.5,
-           "limbs": 0.65}
+WEIGHTS = {"certain": 1.57, "missed": 0.77, "distance": 0.53, "unseen": 2.51, "stretch": 0.57, "inverted": 0.5,
+           "limbs": 0.73}
 EVIDENCE = tuple(WEIGHTS)[1:]
 FIGURES, TIMES, FAILURES, LIMBS = "registration.csv", "times.csv", "failures.csv", "limbs.csv"
 
@@ -159,12 +159,14 @@ class Limits(Settings):
     """
 
     # Median and maximum over 24 correctly registered synthetic people: missed 0.0004, 0.010; distance 0.00065,
-    # 0.00067; stretch 0.001, 0.009; landmarks 0.0015, 0.0018; none inverted. A real one that is 20 mm off has stretch
-    # 0.047; with sides exchanged, missed 0.13 and stretch 0.10.
+    # 0.00067; landmarks 0.0015, 0.0018; none inverted. Stretch says little: skin of two people, one by one true to the
+    # place, is stretched on 0.016 in the median and 0.053 at most, where one is slim or bends, and the built-in people
+    # reach 0.009. Of 132 registrations no wrong one had 0.02 to 0.06 and no other reason. With sides exchanged missed
+    # is 0.13 and stretch 0.10.
     missed: float = 0.005
     distance: float = 0.002
     unseen: float = 0.15
-    stretch: float = 0.02
+    stretch: float = 0.06
     inverted: float = 0.001
     landmarks: float = 0.015
     limbs: float = 1.0
