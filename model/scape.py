@@ -22,7 +22,7 @@ from .linear import Subject, check_pose, combination_weights
 from .pose_space import PoseSpace, faces_of_part
 from .priors import sample_poses
 from .products import Terms
-from .resolution.transfer import Piece, SurfaceCarrier, gradients_of
+from .resolution.transfer import Piece, SurfaceCarrier, gradients_of, mount
 from .shape_space import ShapeSpace
 from .stitching import StitchingSystem
 
@@ -234,7 +234,7 @@ class ScapeModel(BodyModel):
             return moved
         # three poses for each feature of the part with the most features determine the regression
         poses = sample_poses(self, max(40, 3 * int(np.bincount(self.features.part).max())), np.random.default_rng(0))
-        poses[0], follow = self.pose_mean, SurfaceCarrier(self.template, template)
+        poses[0], follow = self.pose_mean, mount(self.template, template)
         moved = _with_pose_space(moved, poses, follow.positions(self.subject(None).vertices(poses)), rounds)
         return _with_shape_space(moved, self, follow, poses[:8], rounds, progress) if self.n_betas else moved
 

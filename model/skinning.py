@@ -19,7 +19,7 @@ from .body import BodyModel, Progress, restore_variances
 from .features import PoseFeatures, RotationLift
 from .linear import Subject, combination_weights
 from .products import Products, Terms
-from .resolution.transfer import SurfaceCarrier
+from .resolution.transfer import mount
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -258,7 +258,7 @@ class SkinningModel(BodyModel):
 
     def resample(self, template: Mesh, skeleton: Skeleton, rounds: int, progress: Progress) -> SkinningModel:
         # all fields are carried along the surface; weights stay positive
-        follow = SurfaceCarrier(self.template, template)
+        follow = mount(self.template, template)
 
         def displaced(field: np.ndarray) -> np.ndarray:
             return follow.displacements(field.astype(np.float64)).astype(field.dtype)

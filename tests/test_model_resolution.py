@@ -10,7 +10,7 @@ from model.cli import group
 from model.features import linear_features
 from model.pose_space import PoseSpace
 from model.resolution.change import ResolutionConfig, change_resolution, resample, resolution_gap, subdivide_at_middles
-from model.resolution.transfer import Piece, SurfaceCarrier, gradients_of, transfer_skeleton
+from model.resolution.transfer import Piece, gradients_of, mount, transfer_skeleton
 from model.scape import BlendScapeModel, ScapeModel
 from model.shape_space import ShapeSpace
 from scanprep import decimate, write_mesh
@@ -33,7 +33,7 @@ def finer(model):
 
 def apart(a, b, pose, betas=None):
     """Mean and largest distance of the vertices of b from the points of a on which they lie at rest, metres."""
-    ridden = SurfaceCarrier(a.template, b.template).positions(a.vertices(pose, betas))
+    ridden = mount(a.template, b.template).positions(a.vertices(pose, betas))
     far = np.linalg.norm(ridden - b.vertices(pose, betas), axis=-1)
     return far.mean(), far.max()
 
@@ -107,7 +107,7 @@ def test_there_and_back(model, finer):
 
 def test_the_place_stays(model, finer):
     for pose in typical(model):
-        shift = SurfaceCarrier(model.template, finer.template).positions(model.vertices(pose)) - finer.vertices(pose)
+        shift = mount(model.template, finer.template).positions(model.vertices(pose)) - finer.vertices(pose)
         assert np.linalg.norm(shift.mean(axis=0)) < 2e-3
     trans = np.array([1.0, 2.0, 3.0])
     np.testing.assert_allclose(finer.vertices(pose, None, trans) - finer.vertices(pose), np.tile(trans, (
@@ -187,7 +187,7 @@ def test_followers_move_stiffly_with_a_stiff_body(model):
     rng = np.random.default_rng(0)
     rider = model.template.with_vertices(model.template.vertices + rng.normal(0, 0.01, model.template.vertices.shape))
     R, t = rotations.exp([0.3, -0.7, 1.1]), np.array([1.0, 2.0, 3.0])
-    moved = SurfaceCarrier(model.template, rider).positions(model.template.vertices @ R.T + t)
+    moved = mount(model.template, rider).positions(model.template.vertices @ R.T + t)
     np.testing.assert_allclose(moved, rider.vertices @ R.T + t, atol=1e-12)
 
 

@@ -12,6 +12,7 @@ from scan_folders import MARKS, QUICK, ball, contents, write_scans
 from scipy.spatial.transform import Rotation
 
 from model.coregistration.lead import ModelLead
+from model.resolution.transfer import mount
 from scanprep import Mesh, RegisteredSet, read_mesh, write_mesh
 from scanprep.batch.ownership import HOME, ForeignFileError
 from scanprep.batch.pool import Workers
@@ -230,7 +231,7 @@ def test_correspondences_lead_where_there_are_no_landmarks(scans, template, tmp_
 @pytest.mark.slow
 def test_a_model_leads_where_there_are_no_landmarks_or_few(scans, template, tmp_path, monkeypatch):
     """It is laid on the template once; asked for by name it also leads scans with few landmarks."""
-    asked, lead = [], ModelLead("balls", np.zeros((642, 3), dtype=np.int64), np.ones((642, 3)) / 3, np.zeros(642))
+    asked, lead = [], ModelLead("balls", mount(template, template))
     monkeypatch.setattr(ModelLead, "__call__", lambda self, scan, landmarks=None, model=None, up=None: [scan.vertices])
     monkeypatch.setattr(preparing, "lead_of", lambda template, through, progress: asked.append(through) or lead)
     turned = template.with_vertices(template.vertices @ Rotation.from_rotvec([2.0, 0, 0]).as_matrix().T)

@@ -8,6 +8,7 @@ import pytest
 from scan_folders import WITH_PICTURES, ball, contents
 
 from model.coregistration.lead import ModelLead
+from model.resolution.transfer import mount
 from scanprep import Mesh, RegisteredSet, read_mesh, write_mesh
 from scanprep.batch.opening import workspace
 from scanprep.pipeline import bootstrap
@@ -33,7 +34,7 @@ def call(tmp_path, monkeypatch):
     write_mesh(tmp_path / "scans" / "alone.ply", EGG)
     write_mesh(tmp_path / "scans" / "beside.ply", Mesh(np.vstack([EGG.vertices, board]), faces))
     write_mesh(tmp_path / "template.ply", EGG)
-    lead = ModelLead("eggs", np.zeros((642, 3), dtype=np.int64), np.ones((642, 3)) / 3, np.zeros(642))
+    lead = ModelLead("eggs", mount(EGG, EGG))
     monkeypatch.setattr(ModelLead, "__call__", lambda self, scan, *ignored: [EGG.vertices, BACK])
     for module in (preparing, bootstrap):
         monkeypatch.setattr(module, "lead_of", lambda template, *args: lead)

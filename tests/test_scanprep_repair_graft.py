@@ -70,7 +70,7 @@ def test_a_fit_that_leaves_what_its_start_covers_is_not_kept(person, monkeypatch
 
 
 def test_a_fit_that_fuses_two_fingers_is_not_kept():
-    """The scan lacks one finger, here a ball: without data it slides into its neighbour, and all of the scan is covered."""
+    """The scan lacks one finger, here a ball; without data it slides into its neighbour, and the scan is covered."""
     one = ball(3)
     both = Mesh(np.concatenate([one.vertices, one.vertices + [0.3, 0, 0]]),
                 np.concatenate([one.faces, one.faces + len(one.vertices)]))

@@ -10,7 +10,7 @@ from model.body import BodyModel
 from model.features import linear_features
 from model.linear import combination_weights
 from model.products import ShapedProducts, Terms
-from model.resolution.transfer import SurfaceCarrier
+from model.resolution.transfer import mount
 from scanprep.geometry import storage
 from scanprep.geometry.mesh import Mesh
 from scanprep.skeleton.tree import Skeleton
@@ -52,7 +52,7 @@ class ToyModel(BodyModel):
         return np.swapaxes(T - np.einsum("n,jnd->jd", share, T[:, ring])[:, None], 1, 2)
 
     def resample(self, template, skeleton, rounds, progress):
-        weights = np.maximum(SurfaceCarrier(self.template, template).values(self.weights), 0)
+        weights = np.maximum(mount(self.template, template).values(self.weights), 0)
         return replace(self, template=template, skeleton=skeleton, weights=weights / weights.sum(axis=1)[:, None])
 
     def arrays(self):

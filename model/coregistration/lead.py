@@ -1,7 +1,7 @@
 """Initialisation of a registration by a body model, for a template of any triangles.
 
-1. Once: the model is fitted to the template and laid on it (`fitting/search.py`). Every template vertex gets a place in
-   a triangle of the body and a distance from its skin.
+1. Once: the model is fitted to the template and laid on it (`fitting/search.py`). Every template vertex is mounted on a
+   triangle of the body.
 2. The same search finds the model's body on a scan.
 3. The body carries the template's vertices to the scan, and the registration starts from there.
 """
@@ -34,6 +34,7 @@ from ..fitting.search import Landmarks, ModelMismatchError, find_bodies, lay_mod
 from ..fitting.settings import ScanFitConfig
 from ..learning.config import LearnConfig
 from ..learning.scape import learn_scape
+from ..resolution.transfer import SurfaceCarrier, mount
 
 # the first model of a set only has to find bodies: these settings take a tenth of the time of `scape learn`
 LEARNING = LearnConfig(prunings=(0.01,), ridges=(0.003, 0.03), refinements=1)
@@ -43,31 +44,24 @@ LEARNING = LearnConfig(prunings=(0.01,), ridges=(0.003, 0.03), refinements=1)
 class ModelLead:
     """A model that initialises a template on scans; made by `model_lead`.
 
-    Each template vertex lies in a triangle of the model: `corners` (N, 3) are its vertices and `weights` (N, 3) the
-    barycentric coordinates. `off` (N,), metres, is the distance outside the skin. `landmarks` are the vertices of the
-    template nearest to those that the model names.
+    Its body carries the vertices of the template. `landmarks` are those nearest to the ones that the model names.
     """
 
     name: str                        # of the model, or its file
-    corners: np.ndarray
-    weights: np.ndarray
-    off: np.ndarray
+    carrier: SurfaceCarrier
     parts: PersonParts | None = None
     landmarks: Mapping[str, int] = field(default_factory=dict)
-
-    def carry(self, body: Mesh) -> np.ndarray:
-        """Compute the template's vertices (N, 3), metres, on a body of the model."""
-        ahead = normals_at(body, self.corners, self.weights)
-        return np.einsum("nk,nkd->nd", self.weights, body.vertices[self.corners]) + self.off[:, None] * ahead
 
     def __call__(self, scan: Mesh | np.ndarray, landmarks: Landmarks | None = None, model: Path | None = None,
                  up: Axis | None = None) -> Iterator[np.ndarray]:
         """Yield the template's vertices (N, 3) on the bodies of `find_bodies`, each computed on demand."""
         marked = None
         if landmarks is not None:              # landmarks of the template become the nearest vertices of the model
-            marked = self.corners[landmarks[0], self.weights[landmarks[0]].argmax(axis=1)], landmarks[1]
+            nearest = self.carrier.bary[landmarks[0]].argmax(axis=1)
+            marked = self.carrier.corners[landmarks[0], nearest], landmarks[1]
         body_model = model_at(self.name if model is None else model)
-        return map(self.carry, find_bodies(body_model, scan, marked, None if up is None else direction_of(up)))
+        for body in find_bodies(body_model, scan, marked, None if up is None else direction_of(up)):
+            yield self.carrier.positions(body.vertices)
 
     def person_size(self, scan: Mesh | np.ndarray) -> tuple[float, float]:
         """Find the length of a scan's unit and the stature of the person in it, both in metres."""
@@ -109,11 +103,7 @@ def model_lead(template: Mesh, through: str, progress: Callable[[int, int], None
         if through == "auto":
             return None
         raise ValueError(f"--through {through}: {error}") from error
-    # every vertex of the template gets a place on the body, and a distance from its skin
-    place = Surface(laid).closest(template.vertices)
-    corners = laid.faces[place.faces]
-    off = np.einsum("nd,nd->n", template.vertices - place.points, normals_at(laid, corners, place.bary))
-    return ModelLead(name, corners, place.bary, off, parts,
+    return ModelLead(name, mount(laid, template), parts,
                      nearest_by_name(template, laid, model.info.get("landmarks") or {}))
 
 
@@ -147,12 +137,6 @@ def learn_set_model(template: Mesh, skeleton: Skeleton, poses: np.ndarray, shape
                     ) -> None:
     """Learn a model of registered meshes and write its file, see `scanprep.registration.lead.learn_model`."""
     learn_scape(template, poses, shapes, skeleton, LEARNING).save(path)
-
-
-def normals_at(body: Mesh, corners: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    """Interpolate unit normals (n, 3) of a body at combinations of vertices `corners` (n, 3) by `weights` (n, 3)."""
-    ahead = np.einsum("nk,nkd->nd", weights, body.vertex_normals[corners])
-    return ahead / np.maximum(np.linalg.norm(ahead, axis=1, keepdims=True), 1e-12)
 
 
 def _parts(model: BodyModel, laid: Mesh, template: Mesh) -> PersonParts | None:

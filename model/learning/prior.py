@@ -22,7 +22,7 @@ from ..body import BodyModel
 from ..fitting.search import lay_model
 from ..posing.transfer import own_body
 from ..priors import sample_poses
-from ..resolution.transfer import SurfaceCarrier, transfer_skeleton
+from ..resolution.transfer import mount, transfer_skeleton
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,7 +78,7 @@ def bring_prior(model: BodyModel, template: Mesh, progress: Callable[[int, int],
     """
     laid = lay_model(model, template, progress)
     own = own_body(model, laid.vertices)
-    ride = SurfaceCarrier(laid.with_vertices(own.vertices), template)
+    ride = mount(laid.with_vertices(own.vertices), template)
     # the person in the model's example poses; models without examples draw from their prior
     # Number of the model's example poses that are used, evenly over all. With 50, the skeleton of 8 poses had parts
     # without a name, though held-out poses were 8.5 mm off, and 9.1 mm with 25.

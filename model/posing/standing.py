@@ -17,7 +17,7 @@ from scanprep.geometry.mesh import Mesh
 
 from ..body import BodyModel
 from ..fitting.search import lay_model, nearest_by_name
-from ..resolution.transfer import SurfaceCarrier
+from ..resolution.transfer import SurfaceCarrier, mount
 from .transfer import own_body
 
 
@@ -87,4 +87,4 @@ class StandingModel:
     def _carriers(self) -> tuple[SurfaceCarrier, SurfaceCarrier]:
         """The model's vertices on the template, and those of the template on the model."""
         assert self.laid is not None, "the triangles differ"
-        return SurfaceCarrier(self.template, self.laid), SurfaceCarrier(self.laid, self.template)
+        return mount(self.template, self.laid), mount(self.laid, self.template)

@@ -12,7 +12,7 @@ from scanprep.geometry.surface import Surface
 from scanprep.ranges import Settings
 
 from ..body import BodyModel, Progress
-from .transfer import SurfaceCarrier, transfer_skeleton
+from .transfer import mount, transfer_skeleton
 
 
 @dataclass(frozen=True)
@@ -88,7 +88,7 @@ def resolution_gap(model: BodyModel, changed: BodyModel, poses: np.ndarray, beta
 
     At the vertices of the second, for betas (B, k) or the template's own body.
     """
-    follow, gaps = SurfaceCarrier(model.template, changed.template), []
+    follow, gaps = mount(model.template, changed.template), []
     for b, pose in enumerate(poses):
         own = None if betas is None else betas[b]
         off = follow.positions(model.vertices(pose, own)) - changed.vertices(pose, own)
