@@ -37,7 +37,8 @@ ROOMS = {
         "fitting": "", "motion": "", "resolution": "",
         "export": "motion", "posing": "export fitting motion resolution", "measurement": "posing",
         "learning": "fitting posing resolution",
-        "coregistration": "fitting learning resolution", "statue": "export fitting motion", "evaluation": "fitting posing"},
+        "coregistration": "fitting learning resolution", "statue": "export fitting motion",
+        "evaluation": "fitting posing"},
     "completion": {
         "mocap": "", "partial": "mocap", "demo": "mocap partial", "tracking": "mocap partial",
         "viewing": "mocap partial", "measuring": "partial viewing"}}

@@ -53,7 +53,8 @@ def complete_scan(scans: ScansArg = (), *, output: Output, model: ModelOrNone = 
         template_landmarks: Where these landmarks are on the model's template; else those kept in the model.
         mask: Which points are clothing or hair: .npy, .json or .txt of booleans or of the numbers of points, or a
             mesh or cloud in which they are painted in a colour. One file, or one for each view; for a folder of
-            scans, the folder of such files.
+            scans, the folder of such files. Without it, what is 16 mm and more off skin is found, and listed in
+            mask.json, to be corrected; a file without points says that all is skin.
         unit: Unit of the scan and landmarks; "unknown": it is found together with the body.
         up: The axis of the scan that points up, where it is known: people mostly stand. Of a depth camera that stands
             upright it is -y, written --up=-y, of one upside down y.

@@ -15,12 +15,13 @@ from model.fitting.free_surface import distance_to, free_surface
 from model.fitting.limbs import with_limbs, with_standing
 from model.fitting.rounds import solve_jointly
 from model.fitting.scale import ScaledBody, check_size
-from model.fitting.scan import Scan
+from model.fitting.scan import Scan, ScanPoints, all_points
 from model.fitting.scan_fit import STRANGE, ScanFit, scan_fit
 from model.fitting.starts import best_starts, first_starts, going_on
 from model.linear import Subject
 from model.people import person_judgement
 from model.priors import CRUDE
+from scanprep.depth_camera.picture import DepthPicture
 from scanprep.geometry import storage
 from scanprep.geometry.files import check_same_topology, read_mesh, write_mesh
 from scanprep.geometry.mesh import Mesh
@@ -33,6 +34,7 @@ from scanprep.threads import one_thread
 from .alternation import turns_of
 from .confidence import distance_to_seen, estimate_error, posterior_error, probability_within
 from .inputs import prepare_in_metres
+from .not_skin import find_not_skin
 from .settings import CompletionConfig
 
 Progress = Callable[[int, int], None]
@@ -55,6 +57,7 @@ CROWDED = 0.7
 # ankles has 0.08; four correct results have 0, two of them with fists where the body has fingers. A scan counts as
 # closed when at most NEARLY_CLOSED of its edges are borders.
 OUTSIDE, NEARLY_CLOSED = 0.02, 0.01
+MASK = "mask.json"
 UNJUDGED = Judgement.of(check=["no judgement was made"])
 # Landmarks off by more than ASTRAY of the body's size, with less than ENOUGH of the scan explained, mean that left and
 # right are exchanged. Either alone also occurs in correct results.
@@ -99,6 +102,10 @@ class Completion:
     soles : (float, float), metres, or None
         For a scan that ends flat at the floor: how far the soles were below the floor before they were lifted onto it,
         and how far they still are.
+    not_skin : (n,) bool, or None
+        Points of the scan that were found to be hair or clothes, one view after the other. The body is inside.
+    worn : tuple of str
+        The same in words: "hair on head and chest".
 
     Examples
     --------
@@ -129,6 +136,8 @@ class Completion:
     confidence: np.ndarray | None = None
     judgement: Judgement = UNJUDGED
     soles: tuple[float, float] | None = None
+    not_skin: np.ndarray | None = None
+    worn: tuple[str, ...] = ()
 
     @property
     def measured(self) -> float:
@@ -157,7 +166,8 @@ def complete(body: BodyModel | Subject, scan: Scan, landmarks: tuple[np.ndarray,
     progress : callable, optional
         Called with (done, total).
     masked : (n,) bool, optional
-        Points that are clothing or hair, one view after the other: the body is somewhere inside.
+        Points that are clothing or hair, one view after the other: the body is somewhere inside. Without it they are
+        looked for, and where some are found the search is made once more. All false: there are none.
     start : Completion, optional
         Earlier result for the same scan and model. The fit goes on from it without a search, which takes a few
         seconds, after landmarks were moved or added.
@@ -186,8 +196,44 @@ def complete(body: BodyModel | Subject, scan: Scan, landmarks: tuple[np.ndarray,
     """
     if start is not None and config is not None and config.free_scale:
         raise ValueError("start: expected none where the unit of the scan is not known")
-    # check the input and bring scan and landmarks into metres
     config, report_progress = config or CompletionConfig(), progress or (lambda done, total: None)
+    # a mask that is given, or that an earlier result found, is kept
+    if start is not None and masked is None and start.not_skin is not None:
+        done = _complete(body, scan, landmarks, config, report_progress, start.not_skin, start)[0]
+        return tell_worn(done, start.not_skin, start.worn)
+    done, cloud = _complete(body, scan, landmarks, config, report_progress, masked, start)
+    if masked is not None or isinstance(scan, DepthPicture):
+        return done
+    # hair and clothes are found by the first body; a second one is sought inside, from which more of them stands out
+    skeleton, crude = as_body(body).skeleton, as_body(body).left_out_error
+    found = find_not_skin(done.predicted, skeleton, cloud, len(all_points(scan)), crude)
+    if found is None:
+        return done
+    points, places = found.points, found.places
+    inside = _complete(body, scan, landmarks, config, report_progress, points, None)[0]
+    if inside.judgement.verdict == "failed":
+        return tell_worn(done, points, places)
+    for _ in range(0 if config.free_scale else 3):
+        more = find_not_skin(inside.predicted, skeleton, cloud, len(points), crude)
+        if more is None or (more.points & ~points).mean() < 0.005:          # no more than a hand stands out anew
+            break
+        points, places = points | more.points, more.places
+        inside = _complete(body, scan, landmarks, config, report_progress, points, inside)[0]
+    return tell_worn(inside, points, places)
+
+
+def tell_worn(done: Completion, not_skin: np.ndarray, worn: tuple[str, ...]) -> Completion:
+    """Add hair and clothes to a completion: points (n,) bool, and words. Each but hair on a head alone is a doubt."""
+    doubts = [f"{words}: the body inside is a guess (--mask with a corrected {MASK})" for words in worn
+              if words != "hair on head"]
+    return replace(done, not_skin=not_skin, worn=worn, judgement=done.judgement.merge(Judgement.of(None, doubts)))
+
+
+def _complete(body: BodyModel | Subject, scan: Scan, landmarks: tuple[np.ndarray, np.ndarray] | None,
+              config: CompletionConfig, report_progress: Progress, masked: np.ndarray | None, start: Completion | None
+              ) -> tuple[Completion, ScanPoints]:
+    """Complete a scan whose mask is known; also return its points, metres."""
+    # check the input and bring scan and landmarks into metres
     total, person = config.rounds + 3, as_body(body)
     solve = solve_jointly if config.method == "joint" else turns_of(body, config)
     inputs = prepare_in_metres(person, scan, landmarks, masked, config)
@@ -236,7 +282,7 @@ def complete(body: BodyModel | Subject, scan: Scan, landmarks: tuple[np.ndarray,
     judgement = Judgement.of(list(filter(None, problems)), doubts)
     if isinstance(body, BodyModel):
         judgement = judgement.merge(person_judgement(body, betas))
-    return replace(result, judgement=judgement)
+    return replace(result, judgement=judgement), inputs.cloud
 
 
 def find_contortion(fit: ScanFit, x: np.ndarray, seen: float, marked: bool) -> str | None:
@@ -288,7 +334,8 @@ def find_unexplained(fit: ScanFit, explained: float) -> list[str]:
     # 0.03: a limb that is lost leaves more; so do long hair, 0.05, and clothes, 0.04 to 0.31
     if fit.cloud.person is not None or 1 - explained <= 0.03:
         return []
-    cause = "a second person, or clutter?" if explained < CROWDED else "clutter, or a limb elsewhere"
+    cause = "a second person, or clutter?" if explained < CROWDED else \
+        "more hair or clothes, or clutter" if fit.cloud.masked is not None else "clutter, or a limb elsewhere"
     return [f"{100 * (1 - explained):.1f}% of the scan has no body near: {cause}"]
 
 
@@ -357,15 +404,18 @@ def completion_problem(done: Completion, points: np.ndarray, free_scale: bool = 
 def save_completion(folder: str | Path, completion: Completion) -> Path:
     """Write `completed.ply`, `predicted.ply` and `completion.npz` (arrays and figures) and return the folder.
 
-    `completion.npz` is written last: where it exists, the meshes do too.
+    Where hair or clothes were found, `mask.json` lists their points, to be corrected. `completion.npz` is written last:
+    where it exists, the meshes do too.
     """
     folder = Path(folder)
     write_mesh(folder / "completed.ply", completion.completed)
     write_mesh(folder / "predicted.ply", completion.predicted)
-    array_names = ("pose", "betas", "trans", "seen", "expected_error", "confidence")
+    if completion.not_skin is not None:
+        storage.write_json(folder / MASK, np.flatnonzero(completion.not_skin).tolist())
+    array_names = ("pose", "betas", "trans", "seen", "expected_error", "confidence", "not_skin")
     arrays = {name: getattr(completion, name) for name in array_names if getattr(completion, name) is not None}
     fact_names = ("rms", "explained", "landmark_rms", "converged", "iterations")
-    facts = {name: getattr(completion, name) for name in (*fact_names, "energies", "scale", "soles")}
+    facts = {name: getattr(completion, name) for name in (*fact_names, "energies", "scale", "soles", "worn")}
     facts["judgement"] = str(completion.judgement)
     storage.save(folder / "completion.npz", KIND, VERSION, arrays, facts)
     return folder
@@ -410,8 +460,9 @@ def load_completion(folder: str | Path) -> Completion:
         # arrays with their expected shapes; betas and errors may be missing, the others may not
         N = len(completed.vertices)
         shapes: dict[str, tuple[int | None, ...]] = {"pose": (None, 3), "betas": (None,), "trans": (3,), "seen": (N,),
-                                                     "expected_error": (N,), "confidence": (N,)}
-        stored: dict[str, Any] = {name: storage.numbers(arrays, name, *shape, kinds="b" if name == "seen" else "f")
+                                                     "expected_error": (N,), "confidence": (N,), "not_skin": (None,)}
+        flags = "seen", "not_skin"
+        stored: dict[str, Any] = {name: storage.numbers(arrays, name, *shape, kinds="b" if name in flags else "f")
                                   for name, shape in shapes.items()
                                   if name in arrays or name in ("pose", "trans", "seen")}
         facts: dict[str, Any] = {name: float(header[name]) for name in ("rms", "explained", "landmark_rms")}
@@ -421,4 +472,5 @@ def load_completion(folder: str | Path) -> Completion:
                           energies={name: float(value) for name, value in header["energies"].items()},
                           scale=float(header["scale"]) if header["version"] > 1 else 1.0,
                           judgement=Judgement.read(header["judgement"]) if header["version"] > 2 else UNJUDGED,
-                          soles=None if soles is None else (float(soles[0]), float(soles[1])))
+                          soles=None if soles is None else (float(soles[0]), float(soles[1])),
+                          worn=tuple(map(str, header.get("worn", ()))))

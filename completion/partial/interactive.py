@@ -301,7 +301,8 @@ class CompleteApp(PickApp):
         """Complete a scan; return the result and its points that are clothing or hair."""
         content, masked = self._load_input(scan.path), self._read_masks(scan, files)
         views = list(content.views) if isinstance(content, ScanFiles) else content
-        return complete(self._body(known), views, pairs, self.work.config, report_progress, masked, start), masked
+        done = complete(self._body(known), views, pairs, self.work.config, report_progress, masked, start)
+        return done, done.not_skin if masked is None else masked
 
     def _body(self, known: bool) -> BodyModel | Subject:
         """Return the model, or the person of known shape, the template's own body by default."""

@@ -108,6 +108,7 @@ def complete_files(work: CompletionTask, inputs: CompletionInputs, context: Task
     scan = list(files.views) if depth is None else depth
     done = context.step("completion", (work.body, work.marks, work.config, work.unit, inputs),
                         lambda: complete(work.body, scan, landmarks, work.config, context.report_progress, masked))
+    masked = done.not_skin if masked is None else masked
     return [*write_results(work, inputs, files, done, landmarks, masked, context.folder),
             *write_clicked_markers(context.folder, done, extra_markers(named, work.marks))]
 
@@ -155,6 +156,10 @@ def completion_figures(work: CompletionTask, inputs: CompletionInputs, done: Com
         rows.append(Metric("views", len(inputs.scans)))
     if masked is not None:
         rows.append(Metric("scan points masked", 100 * float(masked.mean()), "%"))
+    if done.worn:
+        rows.append(Metric("not skin", "; ".join(done.worn)))
+    elif inputs.scans[0].suffix.lower() == ".png":
+        rows.append(Metric("not skin", "not looked for in a depth picture"))
     if work.config.free_scale:
         rows.append(Metric("unit of the scan", float(done.scale), "m"))
     return [*rows, *soles_row(done.soles), Metric(LEFT, MM * done.rms, "mm"),

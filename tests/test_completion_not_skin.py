@@ -1,0 +1,115 @@
+"""Hair and clothes are found on a scan, told in words, and the body is sought inside them."""
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from completion.partial.completion import Completion, complete, load_completion, save_completion, tell_worn
+from completion.partial.masks import read_mask
+from completion.partial.not_skin import find_facing_skin, find_limb_roots, find_not_skin
+from model import load_built_in_model
+from model.fitting.scan import prepare_scan
+from scanprep.geometry.mesh import Mesh
+from scanprep.geometry.surface import Surface
+from scanprep.judgement import Judgement
+from scanprep.skeleton.roles import part_kind
+
+MODEL = load_built_in_model()
+BODY, NAMES = MODEL.template, MODEL.skeleton.names
+PART = MODEL.skeleton.part_of_vertex(BODY)
+KINDS = np.array([part_kind(name) for name in NAMES])
+
+
+def covered(*names: str, by: float) -> Mesh:
+    """The body at rest with some of its parts, by name or kind, covered that thick, metres."""
+    on = np.isin(PART, [p for p, name in enumerate(NAMES) if name in names or KINDS[p] in names])
+    return BODY.with_vertices(BODY.vertices + by * on[:, None] * BODY.vertex_normals)
+
+
+def found(scan: Mesh, crude: float | None = None):
+    return find_not_skin(BODY, MODEL.skeleton, prepare_scan(scan), len(scan.vertices), crude)
+
+
+@pytest.mark.parametrize(("parts", "by", "told"), [
+    (("head",), 0.03, ("hair on head",)), (("head", "chest"), 0.03, ("hair on chest and head",)),
+    (("thigh", "shin"), 0.04, ("clothes on thighs and shins",)), (("shin_left",), 0.03, ("clothes on left shin",)),
+    (("abdomen",), 0.03, ("hair or clothes on abdomen",)),
+    (("head", "shin"), 0.03, ("hair on head", "clothes on shins"))])
+def test_what_is_far_out_is_told_by_its_place(parts, by, told):
+    worn = found(covered(*parts, by=by))
+    assert set(worn.places) == set(told)
+    # it is where it was put, but for the rings around
+    share = BODY.vertex_areas @ (worn.vertices & np.isin(PART, [NAMES.index(n) for n in NAMES if n in parts or
+                                                                part_kind(n) in parts]))
+    assert share > 0.75 * BODY.vertex_areas @ worn.vertices
+    # points of a scan in the body's own vertices are those vertices, and what is beside them
+    assert worn.points[worn.vertices].mean() > 0.95 and worn.points.mean() < worn.vertices.mean() + 0.1
+
+
+@pytest.mark.parametrize(("parts", "by"), [((), 0.0), (("head", "thigh", "shin", "chest", "abdomen"), 0.010),
+                                           (("hand",), 0.04), (("foot",), 0.02)])
+def test_skin_is_not_told(parts, by):
+    """A naked body, a heavier one, mittens and shoes."""
+    assert found(covered(*parts, by=by)) is None
+
+
+def test_a_crude_model_and_other_bodies_tell_nothing():
+    scan = covered("thigh", by=0.04)
+    assert found(scan) is not None and found(scan, crude=0.02) is None
+    animal = replace(MODEL.skeleton, names=tuple(f"part{k}" for k in range(len(NAMES))))
+    assert find_not_skin(BODY, animal, prepare_scan(scan), len(scan.vertices)) is None
+
+
+def test_groins_and_armpits_are_where_limbs_meet_the_trunk():
+    at = BODY.vertices[find_limb_roots(BODY, MODEL.skeleton, PART, KINDS)]
+    roots = MODEL.skeleton.joints[[p for p, kind in enumerate(KINDS) if kind in ("thigh", "upper_arm")]]
+    apart = np.linalg.norm(at[:, None] - roots, axis=2)
+    assert apart.min(axis=1).max() < 0.25 and (apart.min(axis=0) < 0.15).all()
+
+
+def test_skin_before_other_skin_is_told_apart():
+    """Two plates 5 cm apart see each other from their insides only; of each vertex 6 cm ahead is beyond the other."""
+    up, gap = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]], dtype=float), np.array([0, 0, 0.05])
+    facing = Mesh(np.concatenate([up, up + gap]), [[0, 1, 2], [3, 5, 4]])
+    away = Mesh(facing.vertices, [[0, 2, 1], [3, 4, 5]])
+    assert find_facing_skin(facing).all() and not find_facing_skin(away).any()
+
+
+def test_hair_on_a_head_is_no_doubt_and_clothes_are():
+    done = completion_of_a_model()
+    hair = tell_worn(done, np.ones(3, dtype=bool), ("hair on head",))
+    assert hair.worn == ("hair on head",) and hair.judgement == done.judgement
+    dressed = tell_worn(done, np.ones(3, dtype=bool), ("clothes on thighs", "hair on head"))
+    assert dressed.judgement.verdict == "check" and "clothes on thighs" in dressed.judgement.why
+    assert "hair" not in dressed.judgement.why
+
+
+def completion_of_a_model():
+    pose, seen = np.zeros((len(NAMES), 3)), np.ones(len(BODY.vertices), dtype=bool)
+    return Completion(BODY, BODY, pose, np.zeros(3), np.zeros(3), seen, 0.001, 1.0, np.nan, True, 1,
+                      judgement=Judgement.of())
+
+
+@pytest.mark.slow
+def test_the_body_is_sought_inside_trousers(tmp_path):
+    """The mask that was found can be read, corrected and given; one without points says that all is skin."""
+    scan = covered("thigh", "shin", by=0.04)
+    legs = np.isin(KINDS[PART], ["thigh", "shin"])
+    inside = complete(MODEL, scan)
+    assert inside.worn == ("clothes on thighs and shins",) and inside.judgement.verdict == "check"
+    as_skin = complete(MODEL, scan, masked=np.zeros(len(scan.vertices), dtype=bool))
+    assert as_skin.not_skin is None and as_skin.worn == ()
+    # nearer to the truth by a third, and with an error that tells
+    off, off_as_skin = (Surface(one.completed).closest(BODY.vertices[legs]).distances.mean()
+                        for one in (inside, as_skin))
+    assert off < 0.67 * off_as_skin
+    assert np.median(inside.expected_error[legs]) > 2 * np.median(inside.expected_error[~legs])
+    # files
+    folder = save_completion(tmp_path / "done", inside)
+    again = load_completion(folder)
+    np.testing.assert_array_equal(again.not_skin, inside.not_skin)
+    assert again.worn == inside.worn
+    np.testing.assert_array_equal(read_mask(folder / "mask.json", scan.vertices), inside.not_skin)
+    # a result goes on with its mask, without another search
+    on = complete(MODEL, scan, start=inside)
+    assert on.worn == inside.worn and (on.not_skin == inside.not_skin).all()
