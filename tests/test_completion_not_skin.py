@@ -32,7 +32,8 @@ def found(scan: Mesh, crude: float | None = None):
 
 @pytest.mark.parametrize(("parts", "by", "told"), [
     (("head",), 0.03, ("hair on head",)), (("head", "chest"), 0.03, ("hair on chest and head",)),
-    (("thigh", "shin"), 0.04, ("clothes on thighs and shins",)), (("shin_left",), 0.03, ("clothes on left shin",)),
+    (("pelvis", "thigh", "shin"), 0.04, ("clothes on pelvis, thighs and shins",)),
+    (("shin_left",), 0.03, ("clothes on left shin",)),
     (("abdomen",), 0.03, ("hair or clothes on abdomen",)),
     (("head", "shin"), 0.03, ("hair on head", "clothes on shins"))])
 def test_what_is_far_out_is_told_by_its_place(parts, by, told):
@@ -51,6 +52,13 @@ def test_what_is_far_out_is_told_by_its_place(parts, by, told):
 def test_skin_is_not_told(parts, by):
     """A naked body, a heavier one, mittens and shoes."""
     assert found(covered(*parts, by=by)) is None
+
+
+def test_clothes_on_both_thighs_reach_the_waist():
+    """As skirts and trousers do, also where they are tight; a bandage of one thigh does not."""
+    pelvis = PART == NAMES.index("pelvis")
+    assert found(covered("thigh", by=0.04)).vertices[pelvis].all()
+    assert not found(covered("thigh_left", by=0.04)).vertices[pelvis].all()
 
 
 def test_a_crude_model_and_other_bodies_tell_nothing():
@@ -96,7 +104,7 @@ def test_the_body_is_sought_inside_trousers(tmp_path):
     scan = covered("thigh", "shin", by=0.04)
     legs = np.isin(KINDS[PART], ["thigh", "shin"])
     inside = complete(MODEL, scan)
-    assert inside.worn == ("clothes on thighs and shins",) and inside.judgement.verdict == "check"
+    assert inside.worn == ("clothes on pelvis, thighs and shins",) and inside.judgement.verdict == "check"
     as_skin = complete(MODEL, scan, masked=np.zeros(len(scan.vertices), dtype=bool))
     assert as_skin.not_skin is None and as_skin.worn == ()
     # nearer to the truth by a third, and with an error that tells

@@ -74,12 +74,27 @@ def find_not_skin(body: Mesh, skeleton: Skeleton, cloud: ScanPoints, count: int,
     pieces = find_pieces(body, out, max(CORE, 3 * (crude or 0.0)))
     if not pieces:
         return None
+    pieces = reach_the_waist(pieces, part, kinds, folds)
     loose = np.any(pieces, axis=0)
     # its points, and those as far out that hang together with them, such as the hem of a skirt; feet below do not
     on_it = np.einsum("nk,nk->n", near.bary, loose[body.faces[near.faces]]) > 0.5
     points = np.zeros(count, dtype=bool)
     points[cloud.index[on_it | find_joined(cloud, on_it, out_of > CORE)]] = True
     return NotSkin(loose, points, _in_words(body, skeleton, part, pieces))
+
+
+def reach_the_waist(pieces: list[np.ndarray], part: np.ndarray, kinds: np.ndarray, folds: np.ndarray
+                    ) -> list[np.ndarray]:
+    """Add hips and pelvis to clothes on both thighs: skirts and trousers hang from the waist, however close there.
+
+    `folds` (N,), metres, is how far each vertex is from groins and armpits.
+    """
+    thighs, covered = np.flatnonzero(kinds == "thigh"), np.any(pieces, axis=0)
+    if min(covered[part == thigh].mean() for thigh in thighs) < 0.1:
+        return pieces
+    pelvis = (kinds[part] == "pelvis") | ((kinds[part] == "thigh") & (folds < 1.5 * FOLD))
+    first = next(k for k, piece in enumerate(pieces) if np.isin(part[piece], thighs).any())
+    return [piece | pelvis if k == first else piece for k, piece in enumerate(pieces)]
 
 
 def find_joined(cloud: ScanPoints, some: np.ndarray, others: np.ndarray) -> np.ndarray:
