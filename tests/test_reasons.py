@@ -30,6 +30,7 @@ SAID_BY = {
     "completion/mocap/mosh/recordings.py find_actors": "mosh",
     "completion/mocap/mosh/work.py _solve": "mosh",
     "completion/partial/completion.py completion_problem": "complete",
+    "completion/partial/completion.py tell_worn": "complete",
     "completion/partial/folder.py FolderCall.tasks": "complete",
     "completion/partial/folder.py FolderCall.description": "complete",
     "completion/partial/inputs.py check_landmarks": "complete",
