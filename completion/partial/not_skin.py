@@ -23,7 +23,7 @@ from scanprep.geometry.surface import Surface
 from scanprep.skeleton.roles import in_words, part_kind
 from scanprep.skeleton.tree import Skeleton
 
-# Metres: how far out the core of a piece is, and the rest of it. Found with these: none of 112 naked people of ten seeds
+# Metres: how far out the core of a piece is, and the rest of it. Found with these: none of 112 naked people of 15 seeds
 # and of 57 real men seen from all sides, one of 30 seen from one side; all of 7 skirts, and 11 of 20 people with hair.
 # With a core of 14 mm it is 2 of the naked people and 7 of the men.
 CORE, GROWN = 0.016, 0.006
