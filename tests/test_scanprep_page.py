@@ -141,7 +141,7 @@ def test_set_without_scans(tmp_path):
 
 @pytest.mark.parametrize("change, reason", [
     ({"missed": 0.02}, "off the template"), ({"distance": 0.004}, "on average"), ({"seen": 0.5}, "without data"),
-    ({"stretch": 0.08}, "stretched"), ({"inverted": 30}, "inverted"), ({"landmarks": 0.04}, "landmarks"),
+    ({"stretch": 0.05}, "stretched"), ({"inverted": 30}, "inverted"), ({"landmarks": 0.04}, "landmarks"),
     ({"converged": False}, "converged"), ({"seen": 0.0, "distance": np.nan, "rms": np.nan}, "nowhere near")])
 def test_each_figure_alone_is_noticed(change, reason):
     figures = [replace(GOOD, name=f"good{k}") for k in range(4)] + [replace(GOOD, name="bad", **change)]

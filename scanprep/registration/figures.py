@@ -2,7 +2,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -143,7 +143,7 @@ class Limits(Settings):
     unseen : float
         Share of vertices without data, above what is usual in the set (its median).
     stretch : float
-        Share of the surface stretched or shrunk to the double or half.
+        Share of the surface of a person stretched or shrunk to the double or half; a third of it on anything else.
     inverted : float
         Share of the triangles that face against their surroundings.
     landmarks : float
@@ -210,6 +210,8 @@ def review(figures: Sequence[ScanFigures], failures: Mapping[str, str], size: fl
     scans. One view of a person is as usual: what it does not show of limbs is among the doubts.
     """
     limits = limits or Limits()
+    if doubts is None:                 # only of people it is known how unlike they are, and their limbs are judged too
+        limits = replace(limits, stretch=limits.stretch / 3)
     if usual is None:
         usual = float(np.median([1 - f.seen for f in figures])) if figures else 0.0
         usual = usual if doubts is None else max(usual, ONE_VIEW)
