@@ -6,8 +6,9 @@ import pytest
 
 from completion.partial.completion import Completion, complete, load_completion, save_completion, tell_worn
 from completion.partial.masks import read_mask
-from completion.partial.not_skin import find_facing_skin, find_limb_roots, find_not_skin
 from model import load_built_in_model
+from model.fitting.bodies import as_body
+from model.fitting.not_skin import find_backs, find_facing_skin, find_limb_roots, find_not_skin
 from model.fitting.scan import prepare_scan
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.surface import Surface
@@ -27,7 +28,9 @@ def covered(*names: str, by: float) -> Mesh:
 
 
 def found(scan: Mesh, crude: float | None = None):
-    return find_not_skin(BODY, MODEL.skeleton, prepare_scan(scan), len(scan.vertices), crude)
+    person = as_body(MODEL)
+    person.left_out_error = crude
+    return find_not_skin(BODY, person, prepare_scan(scan), len(scan.vertices))
 
 
 @pytest.mark.parametrize(("parts", "by", "told"), [
@@ -64,8 +67,21 @@ def test_clothes_on_both_thighs_reach_the_waist():
 def test_a_crude_model_and_other_bodies_tell_nothing():
     scan = covered("thigh", by=0.04)
     assert found(scan) is not None and found(scan, crude=0.02) is None
-    animal = replace(MODEL.skeleton, names=tuple(f"part{k}" for k in range(len(NAMES))))
+    animal = as_body(MODEL)
+    animal.skeleton = replace(MODEL.skeleton, names=tuple(f"part{k}" for k in range(len(NAMES))))
     assert find_not_skin(BODY, animal, prepare_scan(scan), len(scan.vertices)) is None
+
+
+@pytest.mark.parametrize(("turn", "told"), [(1.0, True), (-1.0, False)])
+def test_less_is_told_behind_than_in_front(turn, told):
+    """People differ in bellies and faces, not in backs."""
+    backs, scalp = find_backs(BODY, PART, KINDS)
+    assert scalp[BODY.vertices[:, 2].argmax()] and not scalp[MODEL.info["landmarks"]["nose tip"]]
+    assert (BODY.vertices[backs & (KINDS[PART] == "head")].mean(axis=0) @ [0, 1, 0]
+            > BODY.vertices[KINDS[PART] == "head"].mean(axis=0) @ [0, 1, 0])
+    side = np.clip(4 * turn * BODY.vertex_normals @ [0, 1, 0], 0, 1) * np.isin(KINDS[PART], ["head", "chest"])
+    worn = found(BODY.with_vertices(BODY.vertices + 0.015 * side[:, None] * BODY.vertex_normals))
+    assert (worn is not None) == told
 
 
 def test_groins_and_armpits_are_where_limbs_meet_the_trunk():

@@ -23,6 +23,7 @@ from scanprep.pipeline import scan as one_scan
 from scanprep.pipeline.prepare import prepare
 from scanprep.pipeline.scans import find_scans
 from scanprep.registration import unmarked
+from scanprep.registration.lead import Proposal
 from scanprep.registration.limbs import PlausibilityIssue
 from scanprep.registration.nonrigid import LedRegistration, register
 
@@ -232,7 +233,7 @@ def test_correspondences_lead_where_there_are_no_landmarks(scans, template, tmp_
 def test_a_model_leads_where_there_are_no_landmarks_or_few(scans, template, tmp_path, monkeypatch):
     """It is laid on the template once; asked for by name it also leads scans with few landmarks."""
     asked, lead = [], ModelLead("balls", mount(template, template))
-    monkeypatch.setattr(ModelLead, "__call__", lambda self, scan, landmarks=None, model=None, up=None: [scan.vertices])
+    monkeypatch.setattr(ModelLead, "__call__", lambda self, scan, *ignored: [Proposal(scan.vertices)])
     monkeypatch.setattr(preparing, "lead_of", lambda template, through, progress: asked.append(through) or lead)
     turned = template.with_vertices(template.vertices @ Rotation.from_rotvec([2.0, 0, 0]).as_matrix().T)
     write_mesh(scans / "body0.ply", turned)

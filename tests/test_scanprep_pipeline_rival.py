@@ -20,6 +20,7 @@ from scanprep.pipeline.mend import MendApp
 from scanprep.pipeline.page import judge_set
 from scanprep.pipeline.rivals import TWO_BODIES, doubt_rival, is_chosen
 from scanprep.registration.figures import Verdict
+from scanprep.registration.lead import Proposal
 from scanprep.viewer.messages import Message
 
 EGG = ball()
@@ -35,7 +36,7 @@ def call(tmp_path, monkeypatch):
     write_mesh(tmp_path / "scans" / "beside.ply", Mesh(np.vstack([EGG.vertices, board]), faces))
     write_mesh(tmp_path / "template.ply", EGG)
     lead = ModelLead("eggs", mount(EGG, EGG))
-    monkeypatch.setattr(ModelLead, "__call__", lambda self, scan, *ignored: [EGG.vertices, BACK])
+    monkeypatch.setattr(ModelLead, "__call__", lambda self, scan, *ignored: [Proposal(EGG.vertices), Proposal(BACK)])
     for module in (preparing, bootstrap):
         monkeypatch.setattr(module, "lead_of", lambda template, *args: lead)
     monkeypatch.setattr(one_scan, "take_clutter", lambda scan: (scan, 0.0))      # it stays, and leaves a doubt

@@ -13,6 +13,7 @@ from model.fitting.bodies import as_body
 from model.fitting.free_space import free_space_violation
 from model.fitting.free_surface import distance_to, free_surface
 from model.fitting.limbs import with_limbs, with_standing
+from model.fitting.not_skin import find_not_skin
 from model.fitting.rounds import solve_jointly
 from model.fitting.scale import ScaledBody, check_size
 from model.fitting.scan import Scan, ScanPoints, all_points
@@ -34,7 +35,6 @@ from scanprep.threads import one_thread
 from .alternation import turns_of
 from .confidence import distance_to_seen, estimate_error, posterior_error, probability_within
 from .inputs import prepare_in_metres
-from .not_skin import find_not_skin
 from .settings import CompletionConfig
 
 Progress = Callable[[int, int], None]
@@ -205,8 +205,8 @@ def complete(body: BodyModel | Subject, scan: Scan, landmarks: tuple[np.ndarray,
     if masked is not None or isinstance(scan, DepthPicture):
         return done
     # hair and clothes are found by the first body; a second one is sought inside, from which more of them stands out
-    skeleton, crude = as_body(body).skeleton, as_body(body).left_out_error
-    found = find_not_skin(done.predicted, skeleton, cloud, len(all_points(scan)), crude)
+    person = as_body(body)
+    found = find_not_skin(done.predicted, person, cloud, len(all_points(scan)))
     if found is None:
         return done
     points, places = found.points, found.places
@@ -214,7 +214,7 @@ def complete(body: BodyModel | Subject, scan: Scan, landmarks: tuple[np.ndarray,
     if inside.judgement.verdict == "failed":
         return tell_worn(done, points, places)
     for _ in range(0 if config.free_scale else 3):
-        more = find_not_skin(inside.predicted, skeleton, cloud, len(points), crude)
+        more = find_not_skin(inside.predicted, person, cloud, len(points))
         if more is None or (more.points & ~points).mean() < 0.005:          # no more than a hand stands out anew
             break
         points, places = points | more.points, more.places

@@ -19,6 +19,7 @@ from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.surface import Surface
 from scanprep.judgement import WrongScaleError, extent, unit_problem
 from scanprep.ranges import Axis, direction_of
+from scanprep.registration.lead import Proposal
 from scanprep.registration.nonrigid import covers
 from scanprep.registration.person import PersonParts, average_person
 from scanprep.skeleton.tree import Skeleton
@@ -53,15 +54,17 @@ class ModelLead:
     landmarks: Mapping[str, int] = field(default_factory=dict)
 
     def __call__(self, scan: Mesh | np.ndarray, landmarks: Landmarks | None = None, model: Path | None = None,
-                 up: Axis | None = None) -> Iterator[np.ndarray]:
+                 up: Axis | None = None) -> Iterator[Proposal]:
         """Yield the template's vertices (N, 3) on the bodies of `find_bodies`, each computed on demand."""
         marked = None
         if landmarks is not None:              # landmarks of the template become the nearest vertices of the model
             nearest = self.carrier.bary[landmarks[0]].argmax(axis=1)
             marked = self.carrier.corners[landmarks[0], nearest], landmarks[1]
         body_model = model_at(self.name if model is None else model)
-        for body in find_bodies(body_model, scan, marked, None if up is None else direction_of(up)):
-            yield self.carrier.positions(body.vertices)
+        for found in find_bodies(body_model, scan, marked, None if up is None else direction_of(up)):
+            worn = found.not_skin
+            yield Proposal(self.carrier.positions(found.mesh.vertices), None if worn is None else worn.points,
+                           () if worn is None else worn.places)
 
     def person_size(self, scan: Mesh | np.ndarray) -> tuple[float, float]:
         """Find the length of a scan's unit and the stature of the person in it, both in metres."""
@@ -114,7 +117,8 @@ def person_on(scan: Mesh | np.ndarray) -> tuple[Mesh, dict[str, int]] | None:
     # the search takes seconds: ask it only where the scan is as large as people are
     if unit_problem(extent(points), extent(model.template.vertices), "the scan is"):
         return None
-    for body in find_bodies(model, scan, only_if_near=True):         # an animal took half a minute
+    for found in find_bodies(model, scan, only_if_near=True):        # an animal took half a minute
+        body = found.mesh
         size = float(np.sqrt(body.face_areas.sum()))
         # the scan lies on the body, but for clothes and hair, and shows most of it
         shown = cKDTree(points).query(body.vertices)[0] < 0.03 * size

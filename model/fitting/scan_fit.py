@@ -367,17 +367,17 @@ def scan_fit(body: FixedBody, cloud: ScanPoints, vertices: np.ndarray, points: n
 
 
 def prepare_scan_fit(body: FixedBody, scan: Mesh | np.ndarray, vertices: np.ndarray, points: np.ndarray,
-                     config: ScanFitConfig) -> tuple[ScanFit, float]:
+                     config: ScanFitConfig, masked: np.ndarray | None = None) -> tuple[ScanFit, float]:
     """Prepare the fit of a body of any size to a scan; also return the factor by which both were scaled.
 
     The lengths of the search suit a person, so a hand or a horse is scaled to that size. `vertices` (L,) int and
-    `points` (L, 3), metres, are landmarks, none or more.
+    `points` (L, 3), metres, are landmarks, none or more; `masked` (n,) bool points of hair and clothes.
     """
     size = float(np.sqrt(body.template.face_areas.sum()))
     person = 1.36  # metres: root of the surface area of a person; bodies from half to twice that size are not scaled
     factor = 1.0 if 0.5 < size / person < 2 else person / size
     sized = body if factor == 1 else ResizedBody(body, factor)
-    return scan_fit(sized, prepare_scan(scan, metres=factor), vertices, factor * points, config), factor
+    return scan_fit(sized, prepare_scan(scan, masked=masked, metres=factor), vertices, factor * points, config), factor
 
 
 @dataclass(frozen=True, eq=False)

@@ -7,11 +7,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
 
 import numpy as np
 from scipy.spatial import cKDTree
 
-from scanprep.geometry.mesh import Mesh
+from scanprep.geometry.mesh import Mesh, select_points
 from scanprep.registration.nonrigid import register, share_stretched, share_uncovered
 from scanprep.threads import one_thread
 
@@ -19,8 +20,10 @@ from ..body import BodyModel
 from .bodies import FixedBody, as_body
 from .free_surface import free_surface
 from .limbs import ASTRAY, with_limbs, with_standing
+from .not_skin import NotSkin, find_not_skin
 from .rounds import solve_jointly
 from .scale import check_size
+from .scan import point_count
 from .scan_fit import ScanFit, prepare_scan_fit
 from .settings import ScanFitConfig
 from .starts import best_starts, first_starts, from_nothing
@@ -34,6 +37,14 @@ ALIKE, FAR, LOST = 0.015, 0.045, 0.005
 
 class ModelMismatchError(ValueError):
     """The model does not fit the template: it is of another kind of body."""
+
+
+@dataclass(frozen=True, eq=False)
+class FoundBody:
+    """A body on a scan, bent onto its skin, and the hair and clothes around it, if any."""
+
+    mesh: Mesh
+    not_skin: NotSkin | None
 
 
 def nearest_by_name(template: Mesh, laid: Mesh, names: Mapping[str, int]) -> dict[str, int]:
@@ -71,10 +82,10 @@ def lay_model(model: BodyModel, template: Mesh, progress: Callable[[int, int], N
     # largest shares of the template that is uncovered, and of the body that is stretched. A woman has 0.004 and 0.0002;
     # a crab has 0.005 and 0.088.
     other = 0.02, 0.05
-    for body in find_bodies(model, template):
+    for found in find_bodies(model, template):
         report_progress(1, 2)
-        laid = register(body, template, start=body.vertices)
-        if laid.uncovered <= other[0] and share_stretched(body, laid.mesh) <= other[1]:
+        laid = register(found.mesh, template, start=found.mesh.vertices)
+        if laid.uncovered <= other[0] and share_stretched(found.mesh, laid.mesh) <= other[1]:
             report_progress(2, 2)
             return laid.mesh
     raise ModelMismatchError(f"the model does not come to lie on the template, {100 * laid.uncovered:.0f}% of which "
@@ -82,11 +93,12 @@ def lay_model(model: BodyModel, template: Mesh, progress: Callable[[int, int], N
 
 
 def find_bodies(model: BodyModel, scan: Mesh | np.ndarray, landmarks: Landmarks | None = None,
-                up: tuple[float, float, float] | None = None, only_if_near: bool = False) -> Iterator[Mesh]:
+                up: tuple[float, float, float] | None = None, only_if_near: bool = False) -> Iterator[FoundBody]:
     """Yield likely bodies of a model on a scan, each bent onto it where there are data, and computed on demand.
 
-    First comes the best of the typical poses. Then come the best after re-initialisation of limbs, and another body
-    that explains the scan nearly as well, where they differ.
+    Where the best one shows hair or clothes, the search is made again for a body inside them. First comes the best of
+    the typical poses. Then come the best after re-initialisation of limbs, and another body that explains the scan
+    nearly as well, where they differ.
 
     Parameters
     ----------
@@ -106,21 +118,25 @@ def find_bodies(model: BodyModel, scan: Mesh | np.ndarray, landmarks: Landmarks 
     WrongScaleError
         A person of another size than the unit of the scan says.
     """
-    body, size = as_body(model), float(np.sqrt(model.template.face_areas.sum()))
-    fit, coarse, starts, factor = _search(body, scan, landmarks or NO_LANDMARKS, ScanFitConfig(up=up))
+    body, size, config = as_body(model), float(np.sqrt(model.template.face_areas.sum())), ScanFitConfig(up=up)
+    fit, coarse, starts, factor = _search(body, scan, landmarks or NO_LANDMARKS, config)
 
     def mesh_of(x: np.ndarray) -> Mesh:
         """Compute the predicted body of unknowns (P,) at its own size."""
         return model.template.with_vertices(body.vertices(fit.body.in_metres(x)[0]))
 
-    def bend(x: np.ndarray) -> Mesh:
+    def bend(x: np.ndarray) -> FoundBody:
         """Let the surface of the body follow the scan; lengths there are those of the fit."""
         followed, *_ = free_surface(fit.mesh(x), fit.cloud)              # [SCAPE] Eq. 10, over Y
-        return followed.with_vertices(followed.vertices / factor)
+        return FoundBody(followed.with_vertices(followed.vertices / factor), worn)
 
     best = _solve(fit, coarse, starts[0])
     if only_if_near and coarse.find_unexplained(best, coarse.thin).mean() > ASTRAY:
         return
+    worn = find_not_skin(fit.mesh(best), body, fit.cloud, point_count(scan))
+    if worn is not None:
+        fit, coarse, starts, factor = _search(body, scan, landmarks or NO_LANDMARKS, config, worn.points)
+        best, scan = _solve(fit, coarse, starts[0]), select_points(scan, ~worn.points)
     first = mesh_of(best)
     # a body with a limb in the wrong place leaves scan points uncovered: skip it
     lost = share_uncovered(scan, first, FAR * size) > LOST
@@ -132,13 +148,14 @@ def find_bodies(model: BodyModel, scan: Mesh | np.ndarray, landmarks: Landmarks 
 
 
 @one_thread()
-def _search(body: FixedBody, scan: Mesh | np.ndarray, landmarks: Landmarks, config: ScanFitConfig
-            ) -> tuple[ScanFit, ScanFit, np.ndarray, float]:
+def _search(body: FixedBody, scan: Mesh | np.ndarray, landmarks: Landmarks, config: ScanFitConfig,
+            masked: np.ndarray | None = None) -> tuple[ScanFit, ScanFit, np.ndarray, float]:
     """Prepare the fit of a scan, the same with few vertices, and the unknowns (n, P) of likely bodies, best first.
 
-    Also return the factor by which lengths of the fit are larger than those of the scan.
+    `masked` (n,) bool are points of hair and clothes. Also return the factor by which lengths of the fit are larger
+    than those of the scan.
     """
-    fit, factor = prepare_scan_fit(body, scan, *landmarks, config)
+    fit, factor = prepare_scan_fit(body, scan, *landmarks, config, masked)
     few = fit.few()
     starts = first_starts(fit, few)
     if len(landmarks[0]) >= 3:                 # few landmarks determine little: also try starts without them

@@ -7,7 +7,7 @@ from typing import Annotated
 import numpy as np
 from scipy.spatial import cKDTree
 
-from ..geometry.mesh import Mesh
+from ..geometry.mesh import Mesh, select_points
 from ..geometry.places import spacing
 from ..geometry.sanitise import sanitise
 from ..geometry.sparse import label_components
@@ -189,7 +189,7 @@ def clean_scan(scan: Mesh | np.ndarray, config: CleanScanConfig | None = None, l
         rows.append(_component(mesh, own, gap, reason in (why, NEAR), reason))
     kept = np.array([row.kept for row in rows])[label]
     floor = next((p for p in planes if p.height(body.data).min() <= config.gap), None)
-    return CleanedScan(_only(scan, kept), kept, label, tuple(rows), floor, flat)
+    return CleanedScan(select_points(scan, kept), kept, label, tuple(rows), floor, flat)
 
 
 def _as_mesh(scan: Mesh | np.ndarray) -> Mesh:
@@ -297,12 +297,3 @@ def _component(mesh: Mesh, own: np.ndarray, gap: float, kept: bool, reason: str)
     area = float(mesh.face_areas[own[mesh.faces].all(axis=1)].sum()) if len(mesh.faces) else float("nan")
     size = tuple(np.ptp(points, axis=0).tolist()) if len(points) else (0.0, 0.0, 0.0)
     return Component(len(points), area, size, gap, kept, reason)
-
-
-def _only(scan: Mesh | np.ndarray, kept: np.ndarray) -> Mesh | np.ndarray:
-    """Return the kept points (N,) bool of a scan, as a mesh if it was one."""
-    if not isinstance(scan, Mesh):
-        return np.asarray(scan)[kept]
-    if not len(scan.faces):
-        return Mesh(scan.vertices[kept], scan.faces, None if scan.colors is None else scan.colors[kept])
-    return scan.submesh(kept[scan.faces].all(axis=1))[0]

@@ -322,3 +322,16 @@ def _loops(border: np.ndarray) -> list[np.ndarray]:
             if not following.get(v):
                 following.pop(v, None)
     return loops
+
+
+def select_points(scan: Mesh | np.ndarray, kept: np.ndarray) -> Mesh | np.ndarray:
+    """Return the kept points (n,) bool of a scan, as a mesh if it was one.
+
+    >>> select_points(np.eye(3), np.array([True, False, True])).shape
+    (2, 3)
+    """
+    if not isinstance(scan, Mesh):
+        return np.asarray(scan)[kept]
+    if not len(scan.faces):
+        return Mesh(scan.vertices[kept], scan.faces, None if scan.colors is None else scan.colors[kept])
+    return scan.submesh(kept[scan.faces].all(axis=1))[0]

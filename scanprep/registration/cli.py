@@ -1,6 +1,7 @@
 """`scape prep align`, `correspond` and `register`: one mesh onto another."""
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
 
@@ -38,7 +39,7 @@ from .person import PersonParts, person_parts, stature
 from .repair import repair_limbs
 from .schedule import RegistrationConfig
 from .unit import resolve_unit
-from .unmarked import FEW, RIVAL, register_by_any
+from .unmarked import FEW, RIVAL, register_by_any, worn_doubts
 
 
 def align(source: MeshArg, target: Annotated[Path, Place("TARGET")], output: Output, landmarks: Path | None = None,
@@ -161,6 +162,7 @@ def register_one(scan: ScanArg, template: Path, output: Output, landmarks: Path 
             parts = person_parts(body, progress)
     # register: from the pose as it is or from correspondences; else led by the model or few landmarks
     rival: LedRegistration | None = None
+    worn: tuple[str, ...] = ()
     if correspondence_file or through == "pose" or (pairs is None and lead is None and through == "auto"):
         hints = read_correspondences(correspondence_file) if correspondence_file else None
         with bar("registering") as progress:
@@ -173,7 +175,7 @@ def register_one(scan: ScanArg, template: Path, output: Output, landmarks: Path 
             led_by.append(Metric("points of the scan taken off as clutter", 100 * removed, "%"))
         with bar("registering") as progress:
             led = register_by_any(body, data, pairs, lead, parts, config, progress=progress)
-        fit, rival = led.fit, led.rival
+        fit, rival, worn = led.fit, led.rival, led.worn
         led_by.append(Metric("led by", led.way))
     # rest the soles on the floor if the scan ends flat there
     fit = with_soles(body, data, fit, parts)
@@ -187,22 +189,23 @@ def register_one(scan: ScanArg, template: Path, output: Output, landmarks: Path 
         Metric("inverted triangles", fit.inverted), Metric("limbs rolled otherwise", str(fit.rolled)),
         *soles_row(fit.soles),
         Metric("converged", str(fit.converged))], {"register": config},
-                   judgement=judge_registration(scan.name, body, data, fit, pairs, parts, rival is not None))
+                   judgement=judge_registration(scan.name, body, data, fit, pairs, parts, rival is not None, worn))
 
 
 Landmarks = tuple[np.ndarray, np.ndarray]
 
 
 def judge_registration(name: str, template: Mesh, scan: Mesh | np.ndarray, fit: Registration, pairs: Landmarks | None,
-                       parts: PersonParts | None, has_rival: bool = False) -> Judgement:
+                       parts: PersonParts | None, has_rival: bool = False, worn: Sequence[str] = ()) -> Judgement:
     """Judge the registration of one scan by the limits used for sets, and by whether it is a plausible person.
 
-    `has_rival` says whether another body explains the scan about as well.
+    `has_rival` says whether another body explains the scan about as well; `worn` are hair and clothes, in words.
     """
     # first what makes the registration meaningless, then what only needs a look
     problem = registration_problem(template, scan, fit, pairs is not None) or (
         find_exchanged_sides(template, parts, fit.mesh.vertices) if parts else None)
-    doubts = (*limb_doubts(template, parts, fit.mesh.vertices), *hidden_doubts(parts, fit.mesh, fit.seen)) \
+    doubts = (*limb_doubts(template, parts, fit.mesh.vertices), *hidden_doubts(parts, fit.mesh, fit.seen),
+              *worn_doubts(worn)) \
         if parts else ()
     verdict = review([figures_of(name, "", template, fit)], {} if problem is None else {name: problem}, size(template),
                      len(template.faces), doubts={name: doubts} if parts else None,

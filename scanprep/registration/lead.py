@@ -7,6 +7,7 @@ import it.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
 from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Any, Protocol
@@ -19,8 +20,20 @@ from ..skeleton.tree import Skeleton
 from .person import PersonParts, has_limbs
 
 
+@dataclass(frozen=True, eq=False)
+class Proposal:
+    """A body on a scan: the template's vertices (N, 3), metres, and points (n,) bool of the scan that are no skin.
+
+    `worn` says in words what these are: "hair on head".
+    """
+
+    vertices: np.ndarray
+    not_skin: np.ndarray | None = None
+    worn: tuple[str, ...] = ()
+
+
 class Lead(Protocol):
-    """Finds bodies on scans and yields the template's vertices (N, 3), metres, on each, the likeliest body first.
+    """Finds bodies on scans, the likeliest first.
 
     The next body is sought only when it is asked for, so the first one comes fast.
     Landmarks are vertices (L,) of the template and points (L, 3), metres. `model` is the path of the model file, where
@@ -33,7 +46,7 @@ class Lead(Protocol):
     landmarks: Mapping[str, int]
 
     def __call__(self, scan: Mesh | np.ndarray, landmarks: tuple[np.ndarray, np.ndarray] | None = None,
-                 model: Path | None = None, up: Axis | None = None) -> Iterable[np.ndarray]: ...
+                 model: Path | None = None, up: Axis | None = None) -> Iterable[Proposal]: ...
 
     def person_size(self, scan: Mesh | np.ndarray) -> tuple[float, float]:
         """Find the length of a scan's unit and the stature of the person in it, both in metres."""

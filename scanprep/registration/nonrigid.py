@@ -102,6 +102,7 @@ class LedRegistration:
     fit: Registration
     way: str                                    # what initialised it: "model people", "160 correspondences"
     rival: LedRegistration | None = None        # another body on the scan that is almost as plausible
+    worn: tuple[str, ...] = ()                  # hair and clothes that were left out, in words
 
 
 class Method(Protocol):

@@ -15,11 +15,11 @@ import numpy as np
 from ..correspondence.correlated import find_correspondences, find_seeds
 from ..correspondence.correspondences import Correspondences
 from ..correspondence.search import CorrelatedConfig
-from ..geometry.mesh import Mesh
+from ..geometry.mesh import Mesh, select_points
 from ..judgement import HAND, size
 from ..words import number_of
 from .lead import Lead
-from .limbs import find_exchanged_sides, limb_doubts
+from .limbs import PlausibilityIssue, find_exchanged_sides, limb_doubts
 from .matches import Landmarks
 from .nonrigid import LedRegistration, Registration, near_origin, register, registration_problem
 from .person import PersonParts
@@ -32,6 +32,7 @@ CLEARLY = 0.8                        # another registration is better if it has 
 # same result within a millimetre, or one 3 mm worse, and took a minute.
 GRAVE = 3.0
 UNCOVERED = 0.005                    # share of the scan off the template from which on a limb may be missed
+HAIR_ON_HEAD = "hair on head"
 RIVAL = "another body explains the scan as well"
 
 
@@ -42,10 +43,12 @@ class Candidate:
     doubt: float
     fit: Registration
     way: str
+    scan: Mesh | np.ndarray                     # without hair and clothes
+    worn: tuple[str, ...] = ()                  # what these are, in words
 
     @property
     def led(self) -> LedRegistration:
-        return LedRegistration(self.fit, self.way)
+        return LedRegistration(self.fit, self.way, worn=self.worn)
 
 
 @near_origin
@@ -100,18 +103,21 @@ def register_by_any(template: Mesh, scan: Mesh | np.ndarray, landmarks: Landmark
     # the bodies that the model proposes, until one leaves no doubt
     candidates = list[Candidate]()
     if lead is not None:
-        way = ", ".join([*clicked, f"model {lead.name}"])
-        for vertices in lead(scan, landmarks, model, config.up if config else None):
-            fit = register(template, scan, landmarks, config, progress, start=vertices)
-            candidates.append(Candidate(weigh_doubts(template, parts, fit), fit, way))
+        for body in lead(scan, landmarks, model, config.up if config else None):
+            # the template is bent onto skin; under hair and clothes it stays as the model has it
+            bare = scan if body.not_skin is None else select_points(scan, ~body.not_skin)
+            fit = register(template, bare, landmarks, config, progress, start=body.vertices)
+            way = ", ".join([*clicked, f"model {lead.name}", *(f"without {words}" for words in body.worn)])
+            candidates.append(Candidate(weigh_doubts(template, parts, fit), fit, way, bare, body.worn))
             if not candidates[-1].doubt:
                 return candidates[-1].led  # no doubt: try no other body
         # repair the limbs of the best body and of its rival
         first = choose_clearly(candidates)
         chosen = [one for one in (first, find_rival(template, first, candidates)) if one is not None]
         others = [one for one in candidates if one not in chosen]
-        mended = [repair_limbs(template, scan, one.fit, parts, landmarks, config) for one in chosen]
-        candidates = [*(Candidate(weigh_doubts(template, parts, fit), fit, way) for fit in mended), *others]
+        mended = [replace(one, fit=repair_limbs(template, one.scan, one.fit, parts, landmarks, config))
+                  for one in chosen]
+        candidates = [*(replace(one, doubt=weigh_doubts(template, parts, one.fit)) for one in mended), *others]
     # all doubtful, or no model: try correspondences; their failure counts only if there is nothing else
     if landmarks is None and all(one.doubt > GRAVE for one in candidates):
         try:
@@ -123,11 +129,17 @@ def register_by_any(template: Mesh, scan: Mesh | np.ndarray, landmarks: Landmark
             if not registration_problem(template, scan, fit, marked=False):
                 fit = repair_limbs(template, scan, fit, parts, None, config, correspondences=pairs)
             candidates.append(Candidate(weigh_doubts(template, parts, fit), fit,
-                                        number_of(len(pairs), "correspondence")))
+                                        number_of(len(pairs), "correspondence"), scan))
     best = choose_clearly(candidates)
     rival = find_rival(template, best, [one for one in candidates if not registration_problem(
-        template, scan, one.fit, landmarks is not None)])
+        template, one.scan, one.fit, landmarks is not None)])
     return replace(best.led, rival=None if rival is None else rival.led)
+
+
+def worn_doubts(worn: Sequence[str]) -> tuple[PlausibilityIssue, ...]:
+    """Return the doubts of hair and clothes, such as "clothes on thighs"; hair on a head alone hides no measure."""
+    return tuple(PlausibilityIssue(1.0, f"{words}: the body inside is a guess") for words in worn
+                 if words != HAIR_ON_HEAD)
 
 
 def choose_clearly(candidates: Sequence[Candidate]) -> Candidate:

@@ -16,17 +16,18 @@ from scipy.sparse import csr_array, diags_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-from model.fitting.scan import ScanPoints
 from scanprep.geometry.geodesics import SurfaceGraph
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.surface import Surface
 from scanprep.skeleton.roles import in_words, part_kind
 from scanprep.skeleton.tree import Skeleton
 
-# Metres: how far out the core of a piece is, and the rest of it. Found with these: none of 112 naked people of 15 seeds
-# and of 57 real men seen from all sides, one of 30 seen from one side; all of 7 skirts, and 11 of 20 people with hair.
-# With a core of 14 mm it is 2 of the naked people and 7 of the men.
-CORE, GROWN = 0.016, 0.006
+from .bodies import FixedBody
+from .scan import ScanPoints
+
+# Metres: how far out the core of a piece is, the same at backs and backs of heads, and the rest of it. People differ in
+# faces, bellies and breasts, little behind. Found with these: TODO
+CORE, CORE_BEHIND, GROWN = 0.016, 0.012, 0.006
 # Square metres: least area of a piece, and of its core.
 PIECE, PIECE_CORE = 0.003, 0.0009
 # Scanners close groins and armpits: there skin seems up to three times as far out; it falls off over 8 cm.
@@ -42,25 +43,23 @@ class NotSkin:
     places: tuple[str, ...]         # in words: "hair on chest and head", "clothes on thighs"
 
 
-def find_not_skin(body: Mesh, skeleton: Skeleton, cloud: ScanPoints, count: int, crude: float | None = None
-                  ) -> NotSkin | None:
+def find_not_skin(body: Mesh, person: FixedBody, cloud: ScanPoints, count: int) -> NotSkin | None:
     """Find hair and clothes on a scan of a person; None where there are none, or where the body is no person's.
 
     Parameters
     ----------
     body : Mesh
         The predicted body, metres.
-    skeleton : Skeleton
-        Parts of its triangles, named as people's.
+    person : FixedBody
+        Whose body it is. Three times its error on bodies that it was not learned from is no hair.
     cloud : ScanPoints
         Points of the scan.
     count : int
         Number n of all points of the scan, of which the cloud has some.
-    crude : float, optional
-        Error of the model on bodies that it was not learned from, metres. Three times that is no hair.
     """
+    skeleton = person.skeleton
     kinds = np.array([part_kind(name) for name in skeleton.names])
-    if not {"thigh", "upper_arm"} <= set(kinds):
+    if not {"thigh", "upper_arm", "foot"} <= set(kinds):
         return None
     part, near = skeleton.part_of_vertex(body), Surface(body).closest(cloud.points)
     # how far each point lies out of the body
@@ -71,16 +70,34 @@ def find_not_skin(body: Mesh, skeleton: Skeleton, cloud: ScanPoints, count: int,
     silent = np.isin(kinds, ["hand", "foot"])[part] | find_facing_skin(body)
     folds = SurfaceGraph(body).nearest(np.flatnonzero(find_limb_roots(body, skeleton, part, kinds)))[0]
     out = np.where(silent, np.nan, out / (1 + AT_FOLDS * np.exp(-folds / FOLD)))
-    pieces = find_pieces(body, out, max(CORE, 3 * (crude or 0.0)))
+    behind, scalp = find_backs(person.template, part, kinds)
+    core = np.where(behind, CORE_BEHIND, CORE)
+    pieces = find_pieces(body, out, np.maximum(core, 3 * (person.left_out_error or 0.0)))
     if not pieces:
         return None
-    pieces = reach_the_waist(pieces, part, kinds, folds)
+    pieces = reach_the_waist(reach_the_crown(pieces, scalp), part, kinds, folds)
     loose = np.any(pieces, axis=0)
     # its points, and those as far out that hang together with them, such as the hem of a skirt; feet below do not
     on_it = np.einsum("nk,nk->n", near.bary, loose[body.faces[near.faces]]) > 0.5
     points = np.zeros(count, dtype=bool)
     points[cloud.index[on_it | find_joined(cloud, on_it, out_of > CORE)]] = True
     return NotSkin(loose, points, _in_words(body, skeleton, part, pieces))
+
+
+def find_backs(template: Mesh, part: np.ndarray, kinds: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Find the vertices (N,) bool of trunk and head that look backwards, away from where feet point, and the scalp."""
+    foot, shin, chest = (template.vertices[(kinds == kind)[part]].mean(axis=0) for kind in ("foot", "shin", "chest"))
+    up = (chest - shin) / np.linalg.norm(chest - shin)
+    forward = foot - shin - up * (up @ (foot - shin))
+    ahead, above = template.vertex_normals @ (forward / np.linalg.norm(forward)), template.vertex_normals @ up
+    head = (kinds == "head")[part]
+    trunk_or_head = np.isin(kinds, ["head", "neck", "chest", "abdomen", "pelvis"])[part]
+    return trunk_or_head & (ahead < 0), head & ((ahead < 0) | ((above > 0.3) & (ahead < 0.5)))
+
+
+def reach_the_crown(pieces: list[np.ndarray], scalp: np.ndarray) -> list[np.ndarray]:
+    """Add the rest of the scalp (N,) bool to hair on a fifth of it: it grows everywhere there, however close."""
+    return [piece | scalp if piece[scalp].mean() > 0.2 else piece for piece in pieces]
 
 
 def reach_the_waist(pieces: list[np.ndarray], part: np.ndarray, kinds: np.ndarray, folds: np.ndarray
@@ -144,14 +161,17 @@ def find_limb_roots(body: Mesh, skeleton: Skeleton, part: np.ndarray, kinds: np.
     return at_root
 
 
-def find_pieces(body: Mesh, out: np.ndarray, core: float) -> list[np.ndarray]:
-    """Find connected pieces (N,) bool of the body that lie far out (N,), metres, the largest first."""
+def find_pieces(body: Mesh, out: np.ndarray, core: np.ndarray) -> list[np.ndarray]:
+    """Find connected pieces (N,) bool of the body that lie far out, the largest first.
+
+    `out` (N,) is how far, `core` (N,) from where on it is a core, metres.
+    """
     ids = np.flatnonzero(np.nan_to_num(out, nan=-1.0) > GROWN)
     if not len(ids):
         return []
     label = connected_components(csr_array(body.vertex_adjacency)[ids][:, ids], directed=False)[1]
     areas = np.bincount(label, body.vertex_areas[ids])
-    cores = np.bincount(label, body.vertex_areas[ids] * (out[ids] > core))
+    cores = np.bincount(label, body.vertex_areas[ids] * (out[ids] > core[ids]))
     chosen = [k for k in np.argsort(-areas) if areas[k] > PIECE and cores[k] > PIECE_CORE]
     return [np.isin(np.arange(len(out)), ids[label == k]) for k in chosen]
 
