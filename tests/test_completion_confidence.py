@@ -2,9 +2,9 @@ import numpy as np
 import pytest
 from completion_bodies import MEAN, worm_with_prior
 
-from completion.partial.confidence import distance_to_seen, estimate_error, posterior_error, probability_within
 from model.fitting import energy
 from model.fitting.bodies import FixedBody, ShapedBody
+from model.fitting.confidence import distance_to_seen, estimate_error, posterior_error, probability_within
 from model.priors import gaussian_prior
 from scanprep.geometry.least_squares import normal_equations
 

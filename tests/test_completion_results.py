@@ -14,9 +14,9 @@ from completion.partial.completion import (
     load_completion,
     save_completion,
 )
-from completion.partial.confidence import estimate_error
 from completion.partial.settings import CompletionConfig
 from model.fitting.bodies import FixedBody
+from model.fitting.confidence import estimate_error
 from model.fitting.rounds import Solved, solve_jointly
 from model.fitting.scan import prepare_scan
 from model.fitting.scan_fit import scan_fit

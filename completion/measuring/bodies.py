@@ -22,7 +22,7 @@ from ..viewing.kinds import model_of_report
 COMPLETED, PERSON, MOTION = "completion.npz", "subject.json", "motion.npz"
 # Expected errors of the surface, metres: of registered meshes, whose skin is 1 mm from the scan and slides a little; of
 # what their scans do not show, as `scape complete` tells it of half views (11 to 18 mm on seven people); and of bodies
-# made from betas, which are as far from the person as the model's own error in `completion/partial/confidence.py`.
+# made from betas, which are as far from the person as the model's own error in `model/fitting/confidence.py`.
 REGISTERED, HIDDEN, OF_BETAS = 0.0015, 0.0125, 0.0075
 
 

@@ -10,10 +10,12 @@ import numpy as np
 
 from model.body import BodyModel
 from model.fitting.bodies import as_body
+from model.fitting.confidence import distance_to_seen, estimate_error, posterior_error, probability_within
 from model.fitting.free_space import free_space_violation
 from model.fitting.free_surface import distance_to, free_surface
+from model.fitting.inside import reach_farther
 from model.fitting.limbs import with_limbs, with_standing
-from model.fitting.not_skin import find_not_skin
+from model.fitting.not_skin import NotSkin, find_not_skin
 from model.fitting.rounds import solve_jointly
 from model.fitting.scale import ScaledBody, check_size
 from model.fitting.scan import Scan, ScanPoints, all_points
@@ -33,7 +35,6 @@ from scanprep.skeleton.roles import in_words, joint_in_words
 from scanprep.threads import one_thread
 
 from .alternation import turns_of
-from .confidence import distance_to_seen, estimate_error, posterior_error, probability_within
 from .inputs import prepare_in_metres
 from .settings import CompletionConfig
 
@@ -57,6 +58,8 @@ CROWDED = 0.7
 # ankles has 0.08; four correct results have 0, two of them with fists where the body has fingers. A scan counts as
 # closed when at most NEARLY_CLOSED of its edges are borders.
 OUTSIDE, NEARLY_CLOSED = 0.02, 0.01
+# A body inside clothes is searched anew where less than this share of the scan's skin is on it.
+LEFT_ALONE = 0.95
 MASK = "mask.json"
 UNJUDGED = Judgement.of(check=["no judgement was made"])
 # Landmarks off by more than ASTRAY of the body's size, with less than ENOUGH of the scan explained, mean that left and
@@ -145,6 +148,20 @@ class Completion:
         return self.completed.share_of_area(self.seen)
 
 
+@dataclass(frozen=True, eq=False)
+class Fitted:
+    """A completion, the points of its scan in metres, its fit and the unknowns (P,)."""
+
+    result: Completion
+    cloud: ScanPoints
+    fit: ScanFit
+    x: np.ndarray
+
+    def find_not_skin(self, count: int) -> NotSkin | None:
+        """Find hair and clothes on the scan, which has so many points."""
+        return find_not_skin(self.result.predicted, self.fit.body, self.cloud, count)
+
+
 @one_thread()
 def complete(body: BodyModel | Subject, scan: Scan, landmarks: tuple[np.ndarray, np.ndarray] | None = None,
              config: CompletionConfig | None = None, progress: Progress | None = None,
@@ -199,27 +216,33 @@ def complete(body: BodyModel | Subject, scan: Scan, landmarks: tuple[np.ndarray,
     config, report_progress = config or CompletionConfig(), progress or (lambda done, total: None)
     # a mask that is given, or that an earlier result found, is kept
     if start is not None and masked is None and start.not_skin is not None:
-        done = _complete(body, scan, landmarks, config, report_progress, start.not_skin, start)[0]
+        done = _complete(body, scan, landmarks, config, report_progress, start.not_skin, start).result
         return tell_worn(done, start.not_skin, start.worn)
-    done, cloud = _complete(body, scan, landmarks, config, report_progress, masked, start)
+    first = _complete(body, scan, landmarks, config, report_progress, masked, start)
     if masked is not None or isinstance(scan, DepthPicture):
-        return done
+        return first.result
     # hair and clothes are found by the first body; a second one is sought inside, from which more of them stands out
-    person = as_body(body)
-    found = find_not_skin(done.predicted, person, cloud, len(all_points(scan)))
+    count = len(all_points(scan))
+    found = first.find_not_skin(count)
     if found is None:
-        return done
-    points, places = found.points, found.places
-    inside = _complete(body, scan, landmarks, config, report_progress, points, None)[0]
-    if inside.judgement.verdict == "failed":
-        return tell_worn(done, points, places)
+        return first.result
+    if not config.free_scale:
+        found = reach_farther(found, first.fit, first.x, count)
+    # the fit goes on from the first pose; where skin is left without a body, as legs under a gown, it is searched anew
+    def fit_inside(points: np.ndarray, start: Completion | None) -> Fitted:
+        return _complete(body, scan, landmarks, config, report_progress, points, start)
+
+    inside = fit_inside(found.points, None if config.free_scale else first.result)
+    if not config.free_scale and inside.result.explained < LEFT_ALONE:
+        inside = min(inside, fit_inside(found.points, None), key=lambda fitted: fitted.fit.misfit(fitted.x))
     for _ in range(0 if config.free_scale else 3):
-        more = find_not_skin(inside.predicted, person, cloud, len(points))
-        if more is None or (more.points & ~points).mean() < 0.005:          # no more than a hand stands out anew
+        more = inside.find_not_skin(count)
+        if more is None or (more.points & ~found.points).mean() < 0.005:    # no more than a hand stands out anew
             break
-        points, places = points | more.points, more.places
-        inside = _complete(body, scan, landmarks, config, report_progress, points, inside)[0]
-    return tell_worn(inside, points, places)
+        found = found.with_more(more, inside.result.predicted, as_body(body).skeleton)
+        inside = fit_inside(found.points, inside.result)
+    return tell_worn((first if inside.result.judgement.verdict == "failed" else inside).result, found.points,
+                     found.places)
 
 
 def tell_worn(done: Completion, not_skin: np.ndarray, worn: tuple[str, ...]) -> Completion:
@@ -231,7 +254,7 @@ def tell_worn(done: Completion, not_skin: np.ndarray, worn: tuple[str, ...]) -> 
 
 def _complete(body: BodyModel | Subject, scan: Scan, landmarks: tuple[np.ndarray, np.ndarray] | None,
               config: CompletionConfig, report_progress: Progress, masked: np.ndarray | None, start: Completion | None
-              ) -> tuple[Completion, ScanPoints]:
+              ) -> Fitted:
     """Complete a scan whose mask is known; also return its points, metres."""
     # check the input and bring scan and landmarks into metres
     total, person = config.rounds + 3, as_body(body)
@@ -282,7 +305,7 @@ def _complete(body: BodyModel | Subject, scan: Scan, landmarks: tuple[np.ndarray
     judgement = Judgement.of(list(filter(None, problems)), doubts)
     if isinstance(body, BodyModel):
         judgement = judgement.merge(person_judgement(body, betas))
-    return replace(result, judgement=judgement), inputs.cloud
+    return Fitted(replace(result, judgement=judgement), inputs.cloud, fit, solved.x)
 
 
 def find_contortion(fit: ScanFit, x: np.ndarray, seen: float, marked: bool) -> str | None:

@@ -179,7 +179,11 @@ class Contact:
 
 
 class Clothing:
-    """Points of clothing and hair, which enclose the body."""
+    """Points of clothing and hair, which enclose the body.
+
+    They say nothing more: with skin drawn to them even weakly, waists under coats were 15 to 40 cm too wide. Without,
+    the body inside is as people are who have such hands, heads and whatever else is seen.
+    """
 
     def __init__(self, scan: ScanPoints) -> None:
         self.scan = scan
@@ -187,20 +191,11 @@ class Clothing:
 
     def violation(self, places: np.ndarray, normals: np.ndarray) -> Violation:
         """Compute how far vertices (n, 3) with normals (n, 3) stick out; zero inside and where there is no clothing."""
-        over, out, near = self._over(places, normals)
-        depth = np.where(over, np.maximum(out - NOISE, 0), 0.0)
-        normal = self.scan.normals[near]
-        return Violation(depth, normal, places - depth[:, None] * normal)
-
-    def below(self, places: np.ndarray, normals: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Find vertices (n,) under clothing, with the point (n, 3) and normal (n, 3) of the clothing over each."""
-        over, out, near = self._over(places, normals)
-        return over & (out < 0), self.scan.points[near], self.scan.normals[near]
-
-    def _over(self, places: np.ndarray, normals: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Match vertices to clothing: whether there is any, how far the vertex is outside, and the point's number."""
         found = self._near.match(places, normals, CLOTHING, 0.3)
+        normal = self.scan.normals[found.index]
         off = places - self.scan.points[found.index]
-        out = np.einsum("nd,nd->n", off, self.scan.normals[found.index])
+        out = np.einsum("nd,nd->n", off, normal)
         beside = np.sqrt(np.maximum((off**2).sum(axis=1) - out**2, 0))
-        return found.valid & (beside < 2 * self.scan.spacing + 0.3 * np.abs(out)), out, found.index
+        over = found.valid & (beside < 2 * self.scan.spacing + 0.3 * np.abs(out))
+        depth = np.where(over, np.maximum(out - NOISE, 0), 0.0)
+        return Violation(depth, normal, places - depth[:, None] * normal)

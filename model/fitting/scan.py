@@ -88,7 +88,7 @@ def prepare_scan(scan: View | Sequence[View], viewpoint: Any = None, masked: np.
         start += point_count(view)
     whole = parts[0] if len(parts) == 1 else _without_inner_borders(_concatenate(parts))
     whole = replace(whole, viewpoints=from_where)
-    return whole if masked is None else _set_apart(whole, check_mask(masked, start))
+    return whole if masked is None else set_apart(whole, check_mask(masked, start))
 
 
 def prepare_picture(picture: DepthPicture, size: float, marks: np.ndarray) -> ScanPoints:
@@ -231,6 +231,7 @@ def _without_inner_borders(scan: ScanPoints) -> ScanPoints:
     return replace(scan, border=border)
 
 
-def _set_apart(scan: ScanPoints, masked: np.ndarray) -> ScanPoints:
+def set_apart(scan: ScanPoints, masked: np.ndarray) -> ScanPoints:
+    """Set the masked points (n,) bool of a whole scan apart, as clothing and hair."""
     out = masked[scan.index]
     return replace(scan.some(~out), masked=scan.some(out)) if out.any() else scan

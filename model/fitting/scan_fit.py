@@ -53,6 +53,9 @@ class ScanData:
         self.cameras = find_cameras(cloud) if config.free_space_weight > 0 else ()
         self.clothing = None if cloud.masked is None else Clothing(cloud.masked)
         self.thinned = lru_cache(maxsize=4)(cloud.thin)
+        # clothing takes its share of the evidence of the scan with it
+        covered = 0.0 if cloud.masked is None else float(cloud.masked.areas.sum())
+        self.evidence = EVIDENCE * float(cloud.areas.sum()) / (float(cloud.areas.sum()) + covered)
 
     @cached_property
     def outside(self) -> Outside | None:
@@ -310,18 +313,12 @@ class ScanFit:
         normal = np.concatenate([scan.normals[a], self.cloud.normals[hit[b]]])
         distance = np.concatenate([there.distances[a], back.distances[b]])
         share = np.concatenate([np.full(a.sum(), 1 / len(scan.points)), np.full(b.sum(), 0.5 / len(vertices))])
-        weights = EVIDENCE / config.scan_sd**2 * share * energy.geman_mcclure(distance, max(reach / 2, 0.015))
+        weights = self.data.evidence / config.scan_sd**2 * share * energy.geman_mcclure(distance, max(reach / 2, 0.015))
         if self.cloud.person is not None:
             under = np.einsum("nd,nd->n", normal, skin.places[ids] - target) < 0
             # a depth camera sees clothes: skin below what it saw is likely, skin above it is not
             weights = np.where(under, 0.1, 1.0) * weights
-        if self.data.clothing is None:
-            return ids, target, normal, weights
-        # vertices under clothing are drawn to it only weakly
-        under, over, away = self.data.clothing.below(skin.places[vertices], skin.normals[vertices])
-        loose = np.full(under.sum(), EVIDENCE / config.clothing_sd**2 / len(vertices))
-        return (np.concatenate([ids, vertices[under]]), np.concatenate([target, over[under]]),
-                np.concatenate([normal, away[under]]), np.concatenate([weights, loose]))
+        return ids, target, normal, weights
 
     def violations(self, skin: Skin) -> tuple[np.ndarray, ...]:
         """List vertices that violate space, with points and normals of the planes they should reach, and weights.

@@ -19,6 +19,7 @@ from scanprep.threads import one_thread
 from ..body import BodyModel
 from .bodies import FixedBody, as_body
 from .free_surface import free_surface
+from .inside import reach_farther
 from .limbs import ASTRAY, with_limbs, with_standing
 from .not_skin import NotSkin, find_not_skin
 from .rounds import solve_jointly
@@ -134,9 +135,13 @@ def find_bodies(model: BodyModel, scan: Mesh | np.ndarray, landmarks: Landmarks 
     if only_if_near and coarse.find_unexplained(best, coarse.thin).mean() > ASTRAY:
         return
     worn = find_not_skin(fit.mesh(best), body, fit.cloud, point_count(scan))
+    if worn is not None:                       # or a limb that was lost
+        best = _solve_with_limbs(fit, coarse, starts)[0]
+        worn = find_not_skin(fit.mesh(best), body, fit.cloud, point_count(scan))
     if worn is not None:
+        worn = reach_farther(worn, fit, best, point_count(scan))
         fit, coarse, starts, factor = _search(body, scan, landmarks or NO_LANDMARKS, config, worn.points)
-        best, scan = _solve(fit, coarse, starts[0]), select_points(scan, ~worn.points)
+        best, scan = _solve_with_limbs(fit, coarse, starts)[0], select_points(scan, ~worn.points)
     first = mesh_of(best)
     # a body with a limb in the wrong place leaves scan points uncovered: skip it
     lost = share_uncovered(scan, first, FAR * size) > LOST

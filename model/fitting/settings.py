@@ -41,8 +41,6 @@ class ScanFitConfig(Settings):
         scan; 0 when the scan has parts cut away by hand.
     contact_weight : float
         The same for a vertex that stands inside another part of the body.
-    clothing_sd : float, metres
-        How far clothing and hair, of which `complete` is told, usually stand off the skin.
     up : (3,) floats, optional
         The direction that is up in the scan, where people in it mostly stand; without it all directions are tried,
         and for a depth picture its four sides.
@@ -63,6 +61,5 @@ class ScanFitConfig(Settings):
     seed: Seed = 0
     free_space_weight: float = 0.5
     contact_weight: float = 0.5
-    clothing_sd: Positive = 0.06
     up: tuple[Signed, Signed, Signed] | None = None
     ignored_parts: tuple[str, ...] = ()

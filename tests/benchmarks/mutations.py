@@ -367,7 +367,7 @@ MUTATIONS = (
         ("skin pressed twice as deep", "PRESSED = 0.12, 0.015", "PRESSED = 0.12, 0.030"),
         ("clothing inside the body", "over & (out < 0)", "over & (out > 0)"),
         ("the camera that objects least", "worst, each = np.argmax(", "worst, each = np.argmin(")),
-    *of("completion/partial/confidence.py", "completion_confidence",
+    *of("model/fitting/confidence.py", "completion_confidence",
         ("errors set in twice as far", "np.exp(-away / 0.014)", "np.exp(-away / 0.028)"),
         ("errors set in half as far", "np.exp(-away / 0.014)", "np.exp(-away / 0.007)"),
         ("errors add without squares", "(1.4 * posterior)**2 + beyond**2", "(1.4 * posterior + beyond)**2"),

@@ -4,9 +4,10 @@ from __future__ import annotations
 import numpy as np
 from scipy.special import gammainc
 
-from model.fitting.bodies import FixedBody
 from scanprep.geometry.geodesics import SurfaceGraph
 from scanprep.geometry.mesh import Mesh
+
+from .bodies import FixedBody
 
 
 def posterior_error(body: FixedBody, x: np.ndarray, precision: np.ndarray) -> np.ndarray:
