@@ -27,6 +27,7 @@ from model.priors import CRUDE
 from scanprep.depth_camera.picture import DepthPicture
 from scanprep.geometry import storage
 from scanprep.geometry.files import check_same_topology, read_mesh, write_mesh
+from scanprep.geometry.geodesics import SurfaceGraph
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.surface import Surface
 from scanprep.judgement import HAND, Judgement, extent, size, unit_problem
@@ -60,6 +61,7 @@ CROWDED = 0.7
 OUTSIDE, NEARLY_CLOSED = 0.02, 0.01
 # A body inside clothes is searched anew where less than this share of the scan's skin is on it.
 LEFT_ALONE = 0.95
+BESIDE = 0.04                        # metres from clothes, within which what seems to be skin may be clothes
 MASK = "mask.json"
 UNJUDGED = Judgement.of(check=["no judgement was made"])
 # Landmarks off by more than ASTRAY of the body's size, with less than ENOUGH of the scan explained, mean that left and
@@ -287,7 +289,8 @@ def _complete(body: BodyModel | Subject, scan: Scan, landmarks: tuple[np.ndarray
     if cloud.person is not None:
         completed, rms = predicted, distance_to(predicted, cloud.some(used))
     # the expected error of every vertex, and the residuals of the landmarks
-    error = estimate_error(open_error, distance_to_seen(predicted, seen), rms, person.left_out_error)
+    bare = seen if cloud.masked is None else seen & ~near_clothes(predicted, cloud.masked.points)
+    error = estimate_error(open_error, distance_to_seen(predicted, bare), rms, person.left_out_error)
     report_progress(total, total)
     pose, trans, betas = person.split(x)
     shape = body.betas if isinstance(body, Subject) else betas if person.n_betas else None
@@ -306,6 +309,12 @@ def _complete(body: BodyModel | Subject, scan: Scan, landmarks: tuple[np.ndarray
     if isinstance(body, BodyModel):
         judgement = judgement.merge(person_judgement(body, betas))
     return Fitted(replace(result, judgement=judgement), inputs.cloud, fit, solved.x)
+
+
+def near_clothes(body: Mesh, clothes: np.ndarray) -> np.ndarray:
+    """Find the vertices (N,) bool of a body under or beside points (m, 3) of clothes, whose edges follow no line."""
+    under = np.unique(body.faces[Surface(body).closest(clothes).faces])
+    return SurfaceGraph(body).nearest(under)[0] < BESIDE
 
 
 def find_contortion(fit: ScanFit, x: np.ndarray, seen: float, marked: bool) -> str | None:

@@ -17,7 +17,7 @@ RING, MEAN, SHIFT = 0.008, 2, 3      # metres along the limb; rings in a mean; r
 FIRST = 0.10                         # metres from hip and shoulder, where the trunk begins
 # Metres of a step on both legs, on both arms, and of both together. Largest of 142 naked people and of 57 real men:
 LEGS, ARMS, BOTH = 0.0054, 0.0060, 0.0102
-SHIN = 0.55                          # share of a leg's length: below are shin and foot
+SHIN, ANKLE = 0.55, 0.06             # boots begin below this share of a leg's length, and so far above its end, metres
 SOME = 0.003                         # metres: a step that counts once another one is found
 
 
@@ -80,9 +80,9 @@ def find_hems(template: Mesh, skeleton: Skeleton, kinds: np.ndarray, faces: np.n
             sewn |= np.any([limb.along < place for limb, place in zip(ends[end], places, strict=True)], axis=0)
     # boots begin at the shin
     step, places = outward["foot"]
-    on_shin = all(place > SHIN * limb.length for limb, place in zip(ends["foot"], places, strict=True))
-    boots = (kinds == "shin")[part] & np.any([limb.along > place for limb, place in
-                                              zip(ends["foot"], places, strict=True)], axis=0)
+    both = list(zip(ends["foot"], places, strict=True))
+    on_shin = all(SHIN * limb.length < place < limb.length - ANKLE for limb, place in both)
+    boots = (kinds == "shin")[part] & np.any([limb.along > place for limb, place in both], axis=0)
     return sewn, boots & (step > limit) & on_shin
 
 

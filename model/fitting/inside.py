@@ -19,10 +19,11 @@ from .scan import set_apart
 from .scan_fit import ScanData, ScanFit
 
 BARE, NEAR = ("head", "hand", "foot"), 0.03      # kinds of parts; metres
-# Expected errors of the body that bare parts tell of, from which on the scan is no skin: above hems, and around hair
-# and bags, which reach as far as they seem to. Chests, bellies and hips of 57 naked men are 0.7, 0.5 and 0.5 out,
-# clothes 1 and more; what is taken for clothes by mistake widens errors, what is taken for skin makes them wrong.
-COVERED, APART = 0.5, 1.1
+# Expected errors of the body that bare parts tell of, from which on the scan is no skin: above hems of sleeves, above
+# those of skirts and trousers, which end at the waist, and around hair and bags. Chests, bellies and hips of 57 naked
+# men are 0.7, 0.5 and 0.5 out, clothes 1 and more. Skin that is taken for clothes has wider errors, clothes that are
+# taken for skin have wrong ones.
+SLEEVED, BELOW, APART = 0.5, 0.8, 1.1
 EDGE = 0.03                          # metres: a waistband lies on so much of skin that seems bare
 LEAST = 100                          # points of bare parts without which nothing can be said
 
@@ -54,7 +55,7 @@ def reach_farther(worn: NotSkin, fit: ScanFit, x: np.ndarray, count: int) -> Not
     # 1.4 and 7.5 mm as in `estimate_error`
     error = np.hypot(1.4 * posterior_error(inner.body, x, inner.precision(x)), 0.0075)
     # what is out as far and hangs together with what was found
-    limit = COVERED if worn.sewn.any() else APART
+    limit = SLEEVED if worn.sewn[kinds == "upper_arm"].any() else BELOW if worn.sewn.any() else APART
     out = worn.vertices | ((around.out > limit * error) & ~np.isin(kinds, ["hand", "foot"]))
     vertices = np.any([piece for piece in connected_pieces(around.body, out) if (piece & worn.vertices).any()], axis=0)
     if worn.sewn.any():

@@ -165,9 +165,13 @@ def reach_the_waist(covered: np.ndarray, part: np.ndarray, kinds: np.ndarray, fo
 
 def find_joined(cloud: ScanPoints, some: np.ndarray, others: np.ndarray) -> np.ndarray:
     """Find the points (n,) bool among `others` that a chain of others, no wider than a gap, joins to `some`."""
+    if not some.any():
+        return some
     ids = np.flatnonzero(some | others)
     gap = max(0.01, 3 * cloud.spacing)
-    apart, near = cKDTree(cloud.points[ids]).query(cloud.points[ids], min(9, len(ids)), distance_upper_bound=gap)
+    # a list of ranks, as a single one would give arrays of another shape
+    apart, near = cKDTree(cloud.points[ids]).query(cloud.points[ids], list(range(1, min(9, len(ids)) + 1)),
+                                                   distance_upper_bound=gap)
     row, joined = np.broadcast_to(np.arange(len(ids))[:, None], near.shape), np.isfinite(apart)
     graph = csr_array((np.ones(joined.sum()), (row[joined], near[joined])), shape=(len(ids), len(ids)))
     label = connected_components(graph, directed=False)[1]

@@ -8,8 +8,18 @@ from completion.partial.completion import Completion, complete, load_completion,
 from completion.partial.masks import read_mask
 from model import load_built_in_model
 from model.fitting.bodies import as_body
-from model.fitting.not_skin import find_backs, find_facing_skin, find_limb_roots, find_not_skin
+from model.fitting.inside import reach_farther
+from model.fitting.not_skin import (
+    NotSkin,
+    find_backs,
+    find_facing_skin,
+    find_joined,
+    find_limb_roots,
+    find_not_skin,
+)
 from model.fitting.scan import prepare_scan
+from model.fitting.scan_fit import scan_fit
+from model.fitting.settings import ScanFitConfig
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.surface import Surface
 from scanprep.judgement import Judgement
@@ -64,6 +74,47 @@ def test_clothes_on_both_thighs_reach_the_waist():
     assert not found(covered("thigh_left", by=0.04)).vertices[pelvis].all()
 
 
+@pytest.mark.parametrize(("parts", "told"), [
+    (("thigh",), ("clothes on pelvis and thighs",)), (("upper_arm",), ("clothes on abdomen, chest and upper arms",)),
+    (("thigh_left",), None), (("upper_arm_right",), None), (("chest", "abdomen"), None)])
+def test_clothes_that_are_close_are_told_by_their_hems(parts, told):
+    """8 mm around both thighs or upper arms, which end at knees or elbows; on one side it is a bandage."""
+    worn = found(covered(*parts, by=0.008))
+    assert (worn and worn.places) == told
+    if told:
+        assert worn.sewn[np.isin(KINDS[PART], parts)].mean() > 0.9 and not worn.sewn[KINDS[PART] == "hand"].any()
+
+
+def test_boots_begin_with_a_step_outward():
+    """They hide shins, and what is above them is skin; the same step at the thighs is none of theirs."""
+    foot, knee = (BODY.vertices[KINDS[PART] == "shin", 2].min() + z for z in (0.0, 0.40))
+    boots = np.clip((0.5 * (foot + knee) - BODY.vertices[:, 2]) / 0.01, 0, 1) * 0.012
+    scan = BODY.with_vertices(BODY.vertices + boots[:, None] * BODY.vertex_normals)
+    # 30,000 points, as rings of 8 mm need some each
+    rng = np.random.default_rng(0)
+    faces = rng.choice(len(scan.faces), 30_000, p=scan.face_areas / scan.face_areas.sum())
+    points = np.einsum("nk,nkd->nd", rng.dirichlet(np.ones(3), len(faces)), scan.corners[faces])
+    dense = np.hstack([points, scan.face_normals[faces]])
+    worn = find_not_skin(BODY, as_body(MODEL), prepare_scan(dense), len(dense))
+    assert worn.places == ("clothes on shins",) and not worn.sewn.any()
+
+
+def test_clothes_reach_as_far_as_bare_parts_tell():
+    """A loose overall of which only the legs were found: head, hands and feet show that the trunk is thinner."""
+    trunk = ("chest", "abdomen", "pelvis", "upper_arm", "forearm", "thigh", "shin")
+    scan = prepare_scan(covered(*trunk, by=0.04))
+    fit = scan_fit(as_body(MODEL), scan, np.zeros(0, dtype=int), np.zeros((0, 3)), ScanFitConfig())
+    legs = np.isin(KINDS[PART], ["thigh", "shin"])
+    some = NotSkin(legs, legs.copy(), ("clothes on thighs and shins",), legs | (KINDS[PART] == "upper_arm"))
+    x = np.zeros(fit.body.n_angles + 3 + fit.body.n_betas)
+    whole = reach_farther(some, fit, x, len(legs))
+    assert whole.vertices[np.isin(KINDS[PART], ["chest", "abdomen", "pelvis"])].mean() > 0.8
+    assert whole.points[KINDS[PART] == "hand"].mean() < 0.1 and whole.vertices[legs].all()
+    assert whole.places == ("clothes on pelvis, abdomen, chest, upper arms, forearms, thighs and shins",)
+    # without bare parts nothing can be said
+    assert reach_farther(NotSkin(legs | True, legs, (), legs), fit, x, len(legs)).points.sum() == legs.sum()
+
+
 def test_a_crude_model_and_other_bodies_tell_nothing():
     scan = covered("thigh", by=0.04)
     assert found(scan) is not None and found(scan, crude=0.03) is None
@@ -82,6 +133,16 @@ def test_less_is_told_behind_than_in_front(turn, told):
     side = np.clip(4 * turn * BODY.vertex_normals @ [0, 1, 0], 0, 1) * np.isin(KINDS[PART], ["head", "chest"])
     worn = found(BODY.with_vertices(BODY.vertices + 0.015 * side[:, None] * BODY.vertex_normals))
     assert (worn is not None) == told
+
+
+def test_points_are_joined_by_chains():
+    """Two points 5 mm from the first one, one beyond a gap, and a single point alone."""
+    cloud = prepare_scan(np.hstack([np.arange(40)[:, None] * [0.005, 0, 0] + np.arange(40)[:, None] // 20 * [0.1, 0, 0],
+                                    np.tile([0.0, 0, 1], (40, 1))]))
+    first = np.arange(40) == 0
+    np.testing.assert_array_equal(find_joined(cloud, first, np.ones(40, dtype=bool)), np.arange(40) < 20)
+    for some in (first, 0 * first > 0):
+        np.testing.assert_array_equal(find_joined(cloud, some, some), some)
 
 
 def test_groins_and_armpits_are_where_limbs_meet_the_trunk():
