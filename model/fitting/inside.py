@@ -13,7 +13,7 @@ from scanprep.geometry.geodesics import SurfaceGraph
 from scanprep.skeleton.roles import part_kind
 
 from .confidence import posterior_error
-from .not_skin import NotSkin, Surroundings, connected_pieces, describe
+from .not_skin import NotSkin, Surroundings, describe, split_pieces
 from .rounds import solve_jointly
 from .scan import set_apart
 from .scan_fit import ScanData, ScanFit
@@ -57,7 +57,7 @@ def reach_farther(worn: NotSkin, fit: ScanFit, x: np.ndarray, count: int) -> Not
     # what is out as far and hangs together with what was found
     limit = SLEEVED if worn.sewn[kinds == "upper_arm"].any() else BELOW if worn.sewn.any() else APART
     out = worn.vertices | ((around.out > limit * error) & ~np.isin(kinds, ["hand", "foot"]))
-    vertices = np.any([piece for piece in connected_pieces(around.body, out) if (piece & worn.vertices).any()], axis=0)
+    vertices = np.any([piece for piece in split_pieces(around.body, out) if (piece & worn.vertices).any()], axis=0)
     if worn.sewn.any():
         vertices |= SurfaceGraph(around.body).nearest(np.flatnonzero(vertices))[0] < EDGE
     points = worn.points.copy()

@@ -202,13 +202,13 @@ def find_pieces(body: Mesh, out: np.ndarray, core: np.ndarray) -> np.ndarray:
     `out` (N,) is how far, `core` (N,) from where on it is a core, metres.
     """
     areas, found = body.vertex_areas, np.zeros(len(out), dtype=bool)
-    for piece in connected_pieces(body, np.nan_to_num(out, nan=-1.0) > GROWN):
+    for piece in split_pieces(body, np.nan_to_num(out, nan=-1.0) > GROWN):
         if areas[piece].sum() > PIECE and areas[piece & (out > core)].sum() > PIECE_CORE:
             found |= piece
     return found
 
 
-def connected_pieces(body: Mesh, vertices: np.ndarray) -> list[np.ndarray]:
+def split_pieces(body: Mesh, vertices: np.ndarray) -> list[np.ndarray]:
     """Split vertices (N,) bool into pieces (N,) bool that edges of the body connect, the largest first."""
     ids = np.flatnonzero(vertices)
     label = connected_components(csr_array(body.vertex_adjacency)[ids][:, ids], directed=False)[1]
@@ -222,7 +222,7 @@ def describe(body: Mesh, skeleton: Skeleton, vertices: np.ndarray, sewn: np.ndar
     `sewn` (N,) bool lies under clothes for certain, as they end in hems.
     """
     part, found = skeleton.part_of_vertex(body), dict[str, set[int]]()
-    for piece in connected_pieces(body, vertices):
+    for piece in split_pieces(body, vertices):
         # the parts that carry more than a little of it
         areas = np.bincount(part, body.vertex_areas * piece, len(skeleton.names))
         parts = set(np.flatnonzero(areas > max(0.002, 0.2 * areas.max())).tolist())

@@ -26,7 +26,7 @@ from ..registration.person import PersonParts, stature
 from ..registration.repair import repair_limbs
 from ..registration.schedule import RegistrationConfig
 from ..registration.unit import resolve_unit
-from ..registration.unmarked import register_by_any, worn_doubts
+from ..registration.unmarked import doubt_worn, register_by_any
 from ..threads import one_thread
 from .rivals import RIVALS, TWO_BODIES, rival_file, save_figures
 from .scans import ScanTask
@@ -135,7 +135,7 @@ def finish_scan(name: str, template: Mesh, scan: Mesh | np.ndarray, led: LedRegi
         picture, scene = pictures_of(template, scan, fit)
     doubts = () if parts is None else (*limb_doubts(template, parts, fit.mesh.vertices),
                                        *hidden_doubts(parts, fit.mesh, fit.seen),
-                                       *size_doubts(template, parts, fit.mesh.vertices), *worn_doubts(led.worn))
+                                       *size_doubts(template, parts, fit.mesh.vertices), *doubt_worn(led.worn))
     figures = replace(figures_of(name, led.way, template, fit), removed=removed, doubts=doubts)
     rival = None if led.rival is None else finish_scan(name, template, scan, led.rival, parts, removed, pictures)
     return RegisteredScan(fit.mesh.vertices, figures, picture, scene, rival)

@@ -39,7 +39,7 @@ from .person import PersonParts, person_parts, stature
 from .repair import repair_limbs
 from .schedule import RegistrationConfig
 from .unit import resolve_unit
-from .unmarked import FEW, RIVAL, register_by_any, worn_doubts
+from .unmarked import FEW, RIVAL, doubt_worn, register_by_any
 
 
 def align(source: MeshArg, target: Annotated[Path, Place("TARGET")], output: Output, landmarks: Path | None = None,
@@ -205,7 +205,7 @@ def judge_registration(name: str, template: Mesh, scan: Mesh | np.ndarray, fit: 
     problem = registration_problem(template, scan, fit, pairs is not None) or (
         find_exchanged_sides(template, parts, fit.mesh.vertices) if parts else None)
     doubts = (*limb_doubts(template, parts, fit.mesh.vertices), *hidden_doubts(parts, fit.mesh, fit.seen),
-              *worn_doubts(worn)) \
+              *doubt_worn(worn)) \
         if parts else ()
     verdict = review([figures_of(name, "", template, fit)], {} if problem is None else {name: problem}, size(template),
                      len(template.faces), doubts={name: doubts} if parts else None,

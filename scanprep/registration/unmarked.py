@@ -136,7 +136,7 @@ def register_by_any(template: Mesh, scan: Mesh | np.ndarray, landmarks: Landmark
     return replace(best.led, rival=None if rival is None else rival.led)
 
 
-def worn_doubts(worn: Sequence[str]) -> tuple[PlausibilityIssue, ...]:
+def doubt_worn(worn: Sequence[str]) -> tuple[PlausibilityIssue, ...]:
     """Return the doubts of hair and clothes, such as "clothes on thighs"; hair on a head alone hides no measure."""
     return tuple(PlausibilityIssue(1.0, f"{words}: the body inside is a guess") for words in worn
                  if words != HAIR_ON_HEAD)
