@@ -8,6 +8,7 @@ from completion.partial.completion import Completion, complete, load_completion,
 from completion.partial.masks import read_mask
 from model import load_built_in_model
 from model.fitting.bodies import as_body
+from model.fitting.hems import find_hems, find_limbs
 from model.fitting.inside import reach_farther
 from model.fitting.not_skin import (
     NotSkin,
@@ -83,6 +84,17 @@ def test_clothes_that_are_close_are_told_by_their_hems(parts, told):
     assert (worn and worn.places) == told
     if told:
         assert worn.sewn[np.isin(KINDS[PART], parts)].mean() > 0.9 and not worn.sewn[KINDS[PART] == "hand"].any()
+
+
+def test_limbs_of_other_parts_have_no_hems():
+    """A skeleton without shins, as one of few parts has."""
+    kinds = np.where(KINDS == "shin", "foot", KINDS)
+    assert len(find_limbs(BODY, MODEL.skeleton, KINDS, "foot")) == 2
+    assert not find_limbs(BODY, MODEL.skeleton, kinds, "foot")
+    faces, bary = np.arange(len(BODY.faces)), np.full((len(BODY.faces), 3), 1 / 3)
+    for found_skin in (*find_hems(BODY, MODEL.skeleton, kinds, faces, bary, 0.0 * faces),
+                       *find_backs(BODY, PART, kinds)):
+        assert not found_skin.any()
 
 
 def test_boots_begin_with_a_step_outward():

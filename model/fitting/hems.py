@@ -30,11 +30,14 @@ class Limb:
 
 
 def find_limbs(template: Mesh, skeleton: Skeleton, kinds: np.ndarray, end: str) -> list[Limb]:
-    """Measure along the limbs that end in a foot or a hand, in the pose of the template."""
+    """Measure along the limbs of three parts that end in a foot or a hand, in the pose of the template."""
     part, out = skeleton.part_of_vertex(template), []
+    chain = {"foot": ("thigh", "shin"), "hand": ("upper_arm", "forearm")}[end]
     for last in np.flatnonzero(kinds == end):
         middle = skeleton.parents[last]
         first = skeleton.parents[middle]
+        if (kinds[first], kinds[middle]) != chain:
+            continue
         a, b, c = skeleton.joints[[first, middle, last]]
         along = np.full(len(template.vertices), np.nan)
         upper, lower = np.linalg.norm(b - a), np.linalg.norm(c - b)
@@ -67,6 +70,8 @@ def find_hems(template: Mesh, skeleton: Skeleton, kinds: np.ndarray, faces: np.n
     """
     part, limit = skeleton.part_of_vertex(template), max(LEGS, crude)
     ends = {end: find_limbs(template, skeleton, kinds, end) for end in ("foot", "hand")}
+    if any(len(limbs) != 2 for limbs in ends.values()):
+        return np.zeros(len(part), dtype=bool), np.zeros(len(part), dtype=bool)
     inward, outward = ({end: step_on_both([sign * step_along(limb, template.faces[faces], bary, out_of)
                                            for limb in limbs]) for end, limbs in ends.items()} for sign in (1, -1))
     # hems: what is nearer to the trunk than they are, and the part of the trunk beside

@@ -139,6 +139,8 @@ def find_not_skin(body: Mesh, person: FixedBody, cloud: ScanPoints, count: int) 
 
 def find_backs(template: Mesh, part: np.ndarray, kinds: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Find the vertices (N,) bool of trunk and head that look backwards, away from where feet point, and the scalp."""
+    if not {"foot", "shin", "chest"} <= set(kinds[part]):
+        return np.zeros(len(part), dtype=bool), np.zeros(len(part), dtype=bool)
     foot, shin, chest = (template.vertices[(kinds == kind)[part]].mean(axis=0) for kind in ("foot", "shin", "chest"))
     up = (chest - shin) / np.linalg.norm(chest - shin)
     forward = foot - shin - up * (up @ (foot - shin))
