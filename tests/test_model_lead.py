@@ -20,7 +20,7 @@ from scanprep.geometry.rotations import exp
 from scanprep.geometry.surface import Surface
 from scanprep.registration import person
 from scanprep.registration.cli import judge_registration
-from scanprep.registration.lead import find_scanned_person, lead_of
+from scanprep.registration.lead import Proposal, find_scanned_person, lead_of
 from scanprep.registration.nonrigid import register
 from scanprep.registration.unmarked import Candidate, find_rival, register_by_any, weigh_doubts
 from scanprep.synthetic.people import BodyShape, SyntheticPerson, find_pose
@@ -67,7 +67,7 @@ def test_what_leaves_less_to_doubt_is_kept(body, scan, far):
             asked.append(float(np.abs(scan.vertices).max()))
             middle = scan.vertices.mean(axis=0)
             right = near(scan)
-            return [(right - middle) @ exp(np.array([0, 0, np.pi])).T + middle, right]
+            return [Proposal((right - middle) @ exp(np.array([0, 0, np.pi])).T + middle), Proposal(right)]
 
     led = register_by_any(body, there, None, TwoBodies(), config=small())
     assert off(led.fit.mesh.vertices, there.vertices) < 0.008 and led.way == "model crabs" and led.rival is None
@@ -91,7 +91,7 @@ def test_two_bodies_that_explain_a_scan_alike_are_both_kept(far):
 
         def __call__(self, scan, landmarks=None, model=None, up=None):
             middle = scan.vertices[:len(egg.vertices)].mean(axis=0)
-            return [body + middle for body in self.bodies]
+            return [Proposal(body + middle) for body in self.bodies]
 
     def lead_by(*bodies):
         return register_by_any(egg, scan, None, Eggs(*bodies), config=QUICK.scan.registration)
@@ -104,7 +104,7 @@ def test_two_bodies_that_explain_a_scan_alike_are_both_kept(far):
     moved = replace(led.fit, mesh=egg.with_vertices(led.fit.mesh.vertices + (egg.vertices[:, 2:] > 0.6) * [0.5, 0, 0]))
     for seen in (True, False):
         hidden = [replace(fit, seen=(egg.vertices[:, 2] < 0.6) | seen) for fit in (led.fit, moved)]
-        best, other = (Candidate(0.0, fit, "") for fit in hidden)
+        best, other = (Candidate(0.0, fit, "", scan) for fit in hidden)
         assert find_rival(egg, best, [best, other]) == (other if seen else None)
         assert find_rival(egg, best, [best, replace(other, doubt=0.1)]) is None         # one that leaves more to doubt
     assert lead_by(egg.vertices, back + [0.5, 0, 0]).rival is None              # one that explains less

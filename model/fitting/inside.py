@@ -25,6 +25,7 @@ BARE, NEAR = ("head", "hand", "foot"), 0.03      # kinds of parts; metres
 # taken for skin have wrong ones.
 SLEEVED, BELOW, APART = 0.5, 0.8, 1.1
 EDGE = 0.03                          # metres: a waistband lies on so much of skin that seems bare
+BESIDE = 0.06                        # metres: so far hair and bags reach from where they were found
 LEAST = 100                          # points of bare parts without which nothing can be said
 
 
@@ -58,8 +59,11 @@ def reach_farther(worn: NotSkin, fit: ScanFit, x: np.ndarray, count: int) -> Not
     limit = SLEEVED if worn.sewn[kinds == "upper_arm"].any() else BELOW if worn.sewn.any() else APART
     out = worn.vertices | ((around.out > limit * error) & ~np.isin(kinds, ["hand", "foot"]))
     vertices = np.any([piece for piece in split_pieces(around.body, out) if (piece & worn.vertices).any()], axis=0)
+    graph = SurfaceGraph(around.body)
     if worn.sewn.any():
-        vertices |= SurfaceGraph(around.body).nearest(np.flatnonzero(vertices))[0] < EDGE
+        vertices |= graph.nearest(np.flatnonzero(vertices))[0] < EDGE
+    else:                                      # hair on a heavy man is no shirt
+        vertices &= graph.nearest(np.flatnonzero(worn.vertices))[0] < BESIDE
     points = worn.points.copy()
     points[cloud.index[around.points_on(vertices) & ~bare]] = True
     return NotSkin(vertices, points, describe(around.body, skeleton, vertices, worn.sewn), worn.sewn)
