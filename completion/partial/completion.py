@@ -59,7 +59,8 @@ CROWDED = 0.7
 # ankles has 0.08; four correct results have 0, two of them with fists where the body has fingers. A scan counts as
 # closed when at most NEARLY_CLOSED of its edges are borders.
 OUTSIDE, NEARLY_CLOSED = 0.02, 0.01
-# A body inside clothes is searched anew where less than this share of the scan's skin is on it.
+# A body inside clothes is searched anew where less than this share of the scan's skin is on it. Of 41 people in seven
+# kinds of clothes it is 0.62 where legs were lost, 0.89 and 0.94 on two right ones, 0.96 and more on the others.
 LEFT_ALONE = 0.95
 BESIDE = 0.04                        # metres from clothes, within which what seems to be skin may be clothes
 MASK = "mask.json"
@@ -186,7 +187,7 @@ def complete(body: BodyModel | Subject, scan: Scan, landmarks: tuple[np.ndarray,
         Called with (done, total).
     masked : (n,) bool, optional
         Points that are clothing or hair, one view after the other: the body is somewhere inside. Without it they are
-        looked for, and where some are found the search is made once more. All false: there are none.
+        looked for, and where some are found the body is fitted again inside. All false: there are none.
     start : Completion, optional
         Earlier result for the same scan and model. The fit goes on from it without a search, which takes a few
         seconds, after landmarks were moved or added.
@@ -257,7 +258,7 @@ def tell_worn(done: Completion, not_skin: np.ndarray, worn: tuple[str, ...]) -> 
 def _complete(body: BodyModel | Subject, scan: Scan, landmarks: tuple[np.ndarray, np.ndarray] | None,
               config: CompletionConfig, report_progress: Progress, masked: np.ndarray | None, start: Completion | None
               ) -> Fitted:
-    """Complete a scan whose mask is known; also return its points, metres."""
+    """Complete a scan whose mask is known."""
     # check the input and bring scan and landmarks into metres
     total, person = config.rounds + 3, as_body(body)
     solve = solve_jointly if config.method == "joint" else turns_of(body, config)

@@ -181,7 +181,7 @@ class Contact:
 class Clothing:
     """Points of clothing and hair, which enclose the body.
 
-    They say nothing more: with skin drawn to them even weakly, waists under coats were 15 to 40 cm too wide. Without,
+    They say nothing more: with skin drawn to them even weakly, waists under coats were 20 and 38 cm too wide. Without,
     the body inside is as people are who have such hands, heads and whatever else is seen.
     """
 

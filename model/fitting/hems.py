@@ -15,7 +15,8 @@ from scanprep.skeleton.tree import Skeleton
 
 RING, MEAN, SHIFT = 0.008, 2, 3      # metres along the limb; rings in a mean; rings by which left and right may differ
 FIRST = 0.10                         # metres from hip and shoulder, where the trunk begins
-# Metres of a step on both legs, on both arms, and of both together. Largest of 142 naked people and of 57 real men:
+# Metres of a step on both legs, on both arms, and of both together. Largest of 142 naked people: 0.0049, 0.0056 and
+# 0.0082; of 57 real men: 0.0048, 0.0054 and 0.0100.
 LEGS, ARMS, BOTH = 0.0054, 0.0060, 0.0102
 SHIN, ANKLE = 0.55, 0.06             # boots begin below this share of a leg's length, and so far above its end, metres
 SOME = 0.003                         # metres: a step that counts once another one is found

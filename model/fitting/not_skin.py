@@ -152,7 +152,7 @@ def find_backs(template: Mesh, part: np.ndarray, kinds: np.ndarray) -> tuple[np.
 
 def reach_the_crown(covered: np.ndarray, scalp: np.ndarray) -> np.ndarray:
     """Add the rest of the scalp (N,) bool to hair on a fifth of it: it grows everywhere there, however close."""
-    return covered | scalp if covered[scalp].mean() > 0.2 else covered
+    return covered | scalp if covered[scalp].sum() > 0.2 * scalp.sum() else covered
 
 
 def reach_the_waist(covered: np.ndarray, part: np.ndarray, kinds: np.ndarray, folds: np.ndarray) -> np.ndarray:
