@@ -5,6 +5,7 @@ both arms or both legs. Boots begin with a step outward.
 """
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -20,13 +21,18 @@ FIRST = 0.10                         # metres from hip and shoulder, where the t
 LEGS, ARMS, BOTH = 0.0054, 0.0060, 0.0102
 SHIN, ANKLE = 0.55, 0.06             # boots begin below this share of a leg's length, and so far above its end, metres
 SOME = 0.003                         # metres: a step that counts once another one is found
+# Cuffs of close suits are askew, so edges across tilted planes are looked for, metres from the wrist, as seen through a
+# narrow and a wider window; metres of both together on either arm. 199 naked people have 0.0199 and 0.0176 at most, 11
+# of 23 suits of 5 to 6 mm have more. No edge at neck or ankles tells the others.
+CUFF, TILTS, WINDOWS, CUFFS = np.arange(-0.05, 0.01, 0.003), (-0.4, -0.2, 0.0, 0.2, 0.4), (0.014, 0.02), 0.0202
 
 
 @dataclass(frozen=True, eq=False)
 class Limb:
-    """Where the vertices of a limb are along it: (N,) metres from hip or shoulder, NaN elsewhere, and its length."""
+    """Where the vertices of a limb are: metres from hip or shoulder along it, NaN elsewhere, and across its end."""
 
-    along: np.ndarray
+    along: np.ndarray               # (N,)
+    across: np.ndarray              # (N, 2), from the line of the lower bone
     length: float
 
 
@@ -46,7 +52,8 @@ def find_limbs(template: Mesh, skeleton: Skeleton, kinds: np.ndarray, end: str) 
         on, beyond = part == first, np.isin(part, [middle, last])
         along[on] = (template.vertices[on] - a) @ (b - a) / upper
         along[beyond] = upper + (template.vertices[beyond] - b) @ (c - b) / lower
-        out.append(Limb(along, float(upper + lower)))
+        across = (template.vertices - b) @ np.linalg.svd((c - b)[None])[2][1:].T
+        out.append(Limb(along, across, float(upper + lower)))
     return out
 
 
@@ -84,6 +91,9 @@ def find_hems(template: Mesh, skeleton: Skeleton, kinds: np.ndarray, faces: np.n
         if certain and step > SOME:
             sewn |= np.isin(kinds, trunk)[part]
             sewn |= np.any([limb.along < place for limb, place in zip(ends[end], places, strict=True)], axis=0)
+    cuffs = [find_cuff(limb, template.faces[faces], bary, out_of) for limb in ends["hand"]]
+    if np.min(cuffs, axis=0).sum() > max(CUFFS, 3 * crude):
+        sewn |= np.isin(kinds, ["chest", "abdomen", "upper_arm", "forearm"])[part]
     # boots begin at the shin
     step, places = outward["foot"]
     both = list(zip(ends["foot"], places, strict=True))
@@ -112,6 +122,29 @@ def step_along(limb: Limb, corners: np.ndarray, bary: np.ndarray, out_of: np.nda
     allowed = (before > 5) & (after > 5) & (i * RING > FIRST) & (i * RING < limb.length + 0.03)
     out[i[allowed]] = step[allowed]
     return out
+
+
+def find_cuff(limb: Limb, corners: np.ndarray, bary: np.ndarray, out_of: np.ndarray) -> np.ndarray:
+    """Compute the largest edge inward near the end of an arm, as seen through each window, (2,) metres; 0 without any.
+
+    At an edge the surface goes on with the same slope, but nearer to the bone. `corners` and `bary` as above.
+    """
+    place = np.einsum("nk,nk->n", bary, limb.along[corners]) - limb.length
+    on = (np.abs(place) < 0.09) & (np.abs(out_of) < 0.03)
+    place, out_of = place[on], out_of[on]
+    across = np.einsum("nk,nkd->nd", bary[on], limb.across[corners[on]])
+    found = np.zeros(len(WINDOWS))
+    for tilt in itertools.product(TILTS, TILTS):
+        tilted = place + across @ np.array(tilt)
+        for (k, window), middle in itertools.product(enumerate(WINDOWS), CUFF):
+            from_edge = tilted - middle
+            # one millimetre at the edge itself is neither side
+            seen = (np.abs(from_edge) < window) & (np.abs(from_edge) > 0.001)
+            x, before = from_edge[seen], from_edge[seen] < 0
+            if min(before.sum(), (~before).sum()) >= 10:
+                lines = np.column_stack([np.ones(len(x)), x, before])
+                found[k] = max(found[k], np.linalg.solve(lines.T @ lines, lines.T @ out_of[seen])[2])
+    return found
 
 
 def step_on_both(steps: Sequence[np.ndarray]) -> tuple[float, tuple[float, float]]:
