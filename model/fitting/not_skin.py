@@ -30,13 +30,14 @@ from .scan import ScanPoints
 
 # Metres: how far out the core of a piece is, the same at backs and backs of heads, and the rest of it. People differ in
 # faces, bellies and breasts, little behind. Found with these: none of 112 naked people of 15 seeds and of 57 real men
-# seen from all sides, two of 30 seen from one side; all of 7 skirts, and 17 of 20 people with hair. With a core of
+# seen from all sides, one of 30 seen from one side; all of 7 skirts, and 17 of 20 people with hair. With a core of
 # 11.5 mm behind it is one of the men and one person with hair more, with 14 mm before two naked people and 7 men.
 CORE, CORE_BEHIND, GROWN = 0.016, 0.012, 0.006
 # Square metres: least area of a piece, and of its core.
 PIECE, PIECE_CORE = 0.003, 0.0009
 # Scanners close groins and armpits: there skin seems up to three times as far out; it falls off over 8 cm.
 AT_FOLDS, FOLD = 2.0, 0.08
+BORDER = 0.03                        # metres: beside what was not seen, where scanners and smoothing are less exact
 
 
 @dataclass(frozen=True, eq=False)
@@ -118,9 +119,12 @@ def find_not_skin(body: Mesh, person: FixedBody, cloud: ScanPoints, count: int) 
     if not {"thigh", "upper_arm", "foot", "hand"} <= set(kinds):
         return None
     part, around = skeleton.part_of_vertex(body), Surroundings(body, cloud)
-    # fists and toes differ on everybody, and where skin faces skin nobody sees how far out it is
+    graph = SurfaceGraph(body)
+    # fists and toes differ on everybody; where skin faces skin, and beside what was not seen, how far out is uncertain
     silent = np.isin(kinds, ["hand", "foot"])[part] | find_facing_skin(body)
-    folds = SurfaceGraph(body).nearest(np.flatnonzero(find_limb_roots(body, skeleton, part, kinds)))[0]
+    if (unseen := np.isnan(around.out)).any():
+        silent |= graph.nearest(np.flatnonzero(unseen))[0] < BORDER
+    folds = graph.nearest(np.flatnonzero(find_limb_roots(body, skeleton, part, kinds)))[0]
     out = np.where(silent, np.nan, around.out / (1 + AT_FOLDS * np.exp(-folds / FOLD)))
     behind, scalp = find_backs(person.template, part, kinds)
     crude = person.left_out_error or 0.0
