@@ -33,6 +33,8 @@ from .scan import ScanPoints
 # seen from all sides, one of 30 seen from one side; all of 7 skirts, and 17 of 20 people with hair. With a core of
 # 11.5 mm behind it is one of the men and one person with hair more, with 14 mm before two naked people and 7 men.
 CORE, CORE_BEHIND, GROWN = 0.016, 0.012, 0.006
+# In front of the trunk: a pregnant woman's belly is up to 25 mm out of the built-in people, bags 100 and more.
+CORE_BELLY = 0.030
 # Square metres: least area of a piece, and of its core.
 PIECE, PIECE_CORE = 0.003, 0.0009
 # Scanners close groins and armpits: there skin seems up to three times as far out; it falls off over 8 cm.
@@ -126,9 +128,10 @@ def find_not_skin(body: Mesh, person: FixedBody, cloud: ScanPoints, count: int) 
         silent |= graph.nearest(np.flatnonzero(unseen))[0] < BORDER
     folds = graph.nearest(np.flatnonzero(find_limb_roots(body, skeleton, part, kinds)))[0]
     out = np.where(silent, np.nan, around.out / (1 + AT_FOLDS * np.exp(-folds / FOLD)))
-    behind, scalp = find_backs(person.template, part, kinds)
+    behind, belly, scalp = find_backs(person.template, part, kinds)
     crude = person.left_out_error or 0.0
-    far = find_pieces(body, out, np.maximum(np.where(behind, CORE_BEHIND, CORE), 3 * crude))
+    core = np.where(behind, CORE_BEHIND, np.where(belly, CORE_BELLY, CORE))
+    far = find_pieces(body, out, np.maximum(core, 3 * crude))
     sewn, boots = find_hems(person.template, skeleton, kinds, around.near.faces, around.near.bary,
                             np.where(around.aligned, around.out_of, np.nan), 1.5 * crude)
     if not (far | sewn | boots).any():
@@ -141,17 +144,18 @@ def find_not_skin(body: Mesh, person: FixedBody, cloud: ScanPoints, count: int) 
     return NotSkin(loose, points, describe(body, skeleton, loose, sewn), sewn)
 
 
-def find_backs(template: Mesh, part: np.ndarray, kinds: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Find the vertices (N,) bool of trunk and head that look backwards, away from where feet point, and the scalp."""
+def find_backs(template: Mesh, part: np.ndarray, kinds: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Find the vertices (N,) bool of the back of trunk and head, away from where feet point, of belly and of scalp."""
     if not {"foot", "shin", "chest"} <= set(kinds[part]):
-        return np.zeros(len(part), dtype=bool), np.zeros(len(part), dtype=bool)
+        nothing = np.zeros(len(part), dtype=bool)
+        return nothing, nothing, nothing
     foot, shin, chest = (template.vertices[(kinds == kind)[part]].mean(axis=0) for kind in ("foot", "shin", "chest"))
     up = (chest - shin) / np.linalg.norm(chest - shin)
     forward = foot - shin - up * (up @ (foot - shin))
     ahead, above = template.vertex_normals @ (forward / np.linalg.norm(forward)), template.vertex_normals @ up
-    head = (kinds == "head")[part]
-    trunk_or_head = np.isin(kinds, ["head", "neck", "chest", "abdomen", "pelvis"])[part]
-    return trunk_or_head & (ahead < 0), head & ((ahead < 0) | ((above > 0.3) & (ahead < 0.5)))
+    head, trunk = np.isin(kinds, ["head", "neck"])[part], np.isin(kinds, ["chest", "abdomen", "pelvis"])[part]
+    scalp = (kinds == "head")[part] & ((ahead < 0) | ((above > 0.3) & (ahead < 0.5)))
+    return (trunk | head) & (ahead < 0), trunk & (ahead > 0.4), scalp
 
 
 def reach_the_crown(covered: np.ndarray, scalp: np.ndarray) -> np.ndarray:
