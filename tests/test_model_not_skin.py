@@ -4,13 +4,22 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from completion.partial.completion import Completion, complete, load_completion, save_completion, tell_worn
+from completion.partial.completion import (
+    Completion,
+    complete,
+    load_completion,
+    save_completion,
+    tell_worn,
+    widen_errors,
+)
 from completion.partial.masks import read_mask
-from model import load_built_in_model
+from model import find_tapes, load_built_in_model, measure
+from model.fitting import not_skin
 from model.fitting.bodies import as_body
-from model.fitting.hems import find_hems, find_limbs
+from model.fitting.hems import find_hems, find_limbs, has_cuffs
 from model.fitting.inside import reach_farther
 from model.fitting.not_skin import (
+    CLOSE,
     NotSkin,
     find_backs,
     find_facing_skin,
@@ -102,13 +111,60 @@ def test_boots_begin_with_a_step_outward():
     foot, knee = (BODY.vertices[KINDS[PART] == "shin", 2].min() + z for z in (0.0, 0.40))
     boots = np.clip((0.5 * (foot + knee) - BODY.vertices[:, 2]) / 0.01, 0, 1) * 0.012
     scan = BODY.with_vertices(BODY.vertices + boots[:, None] * BODY.vertex_normals)
-    # 30,000 points, as rings of 8 mm need some each
-    rng = np.random.default_rng(0)
-    faces = rng.choice(len(scan.faces), 30_000, p=scan.face_areas / scan.face_areas.sum())
-    points = np.einsum("nk,nkd->nd", rng.dirichlet(np.ones(3), len(faces)), scan.corners[faces])
+    faces, _, points = points_on(scan)
     dense = np.hstack([points, scan.face_normals[faces]])
     worn = find_not_skin(BODY, as_body(MODEL), prepare_scan(dense), len(dense))
     assert worn.places == ("clothes on shins",) and not worn.sewn.any()
+
+
+@pytest.mark.parametrize(("thick", "told"), [(0.013, True), (0.006, False)])
+def test_cuffs_are_edges_at_both_wrists_however_askew(thick, told):
+    arms = find_limbs(BODY, MODEL.skeleton, KINDS, "hand")
+    faces, bary, _ = points_on(BODY)
+    # how far outside the sleeves each point is; their cuffs cross triangles
+    outside = [np.einsum("nk,nk->n", bary, (limb.along + 0.4 * limb.across[:, 0] - limb.length)[BODY.faces[faces]])
+               for limb in arms]
+    left, right = (np.where(one < 0, thick, 0.0) for one in outside)
+    assert has_cuffs(BODY, MODEL.skeleton, KINDS, faces, bary, np.fmax(left, right)) == told
+    # one sleeve is a bandage
+    assert not has_cuffs(BODY, MODEL.skeleton, KINDS, faces, bary, left)
+
+
+def test_a_suit_as_close_as_skin_is_told_and_masks_nothing(monkeypatch):
+    """Nobody knows where the skin is inside; what else is found later does not hide it."""
+    monkeypatch.setattr(not_skin, "has_cuffs", lambda *ends: True)
+    worn = found(BODY)
+    assert worn.places == (CLOSE,) and not worn.points.any() and not worn.vertices.any()
+    hair = NotSkin(KINDS[PART] == "head", worn.points, ("hair on head",), worn.sewn)
+    assert worn.with_more(hair, BODY, MODEL.skeleton).places == ("hair on head", CLOSE)
+
+
+def test_errors_are_wider_under_suits():
+    tight = np.full(len(BODY.vertices), 0.002)
+    done = widen_errors(replace(completion_of_a_model(), expected_error=tight), MODEL.skeleton, 0.01)
+    bare = np.isin(KINDS[PART], ["head", "hand", "foot"])
+    assert (done.expected_error[bare] == 0.002).all() and (done.expected_error[~bare] > 0.012).all()
+    assert done.confidence[bare].min() > 0.99 and done.confidence[~bare].max() < 0.7
+    # 4 to 5 cm of a waist
+    tapes = find_tapes(BODY, MODEL.info["landmarks"])
+    waist = measure(BODY, tapes, expected_error=done.expected_error, only=["waist_girth"]).errors["waist_girth"]
+    assert 0.03 < waist < 0.06
+
+
+def test_a_pregnant_womans_belly_is_no_bag():
+    """25 mm farther out than the body inside, over 20 cm; a bag there is 100 mm thick."""
+    middle = BODY.vertices[(KINDS[PART] == "abdomen") & (BODY.vertex_normals[:, 1] < -0.9)].mean(axis=0)
+    bulge = np.exp(-(np.linalg.norm(BODY.vertices - middle, axis=1) / 0.10) ** 4)[:, None] * BODY.vertex_normals
+    assert found(BODY.with_vertices(BODY.vertices + 0.025 * bulge)) is None
+    assert found(BODY.with_vertices(BODY.vertices + 0.10 * bulge)) is not None
+
+
+def points_on(scan: Mesh) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """30,000 points, as rings of some millimetres need some each: faces (n,), weights (n, 3) and points (n, 3)."""
+    rng = np.random.default_rng(0)
+    faces = rng.choice(len(scan.faces), 30_000, p=scan.face_areas / scan.face_areas.sum())
+    bary = rng.dirichlet(np.ones(3), len(faces))
+    return faces, bary, np.einsum("nk,nkd->nd", bary, scan.corners[faces])
 
 
 def test_clothes_reach_as_far_as_bare_parts_tell():
@@ -138,7 +194,8 @@ def test_a_crude_model_and_other_bodies_tell_nothing():
 @pytest.mark.parametrize(("turn", "told"), [(1.0, True), (-1.0, False)])
 def test_less_is_told_behind_than_in_front(turn, told):
     """People differ in bellies and faces, not in backs."""
-    backs, scalp = find_backs(BODY, PART, KINDS)
+    backs, belly, scalp = find_backs(BODY, PART, KINDS)
+    assert not (backs & belly).any() and set(KINDS[PART[belly]]) == {"chest", "abdomen", "pelvis"}
     assert scalp[BODY.vertices[:, 2].argmax()] and not scalp[MODEL.info["landmarks"]["nose tip"]]
     assert (BODY.vertices[backs & (KINDS[PART] == "head")].mean(axis=0) @ [0, 1, 0]
             > BODY.vertices[KINDS[PART] == "head"].mean(axis=0) @ [0, 1, 0])

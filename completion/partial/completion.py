@@ -13,9 +13,9 @@ from model.fitting.bodies import as_body
 from model.fitting.confidence import distance_to_seen, estimate_error, posterior_error, probability_within
 from model.fitting.free_space import free_space_violation
 from model.fitting.free_surface import distance_to, free_surface
-from model.fitting.inside import reach_farther
+from model.fitting.inside import BARE, reach_farther
 from model.fitting.limbs import with_limbs, with_standing
-from model.fitting.not_skin import NotSkin, find_not_skin
+from model.fitting.not_skin import CLOSE, NotSkin, find_not_skin
 from model.fitting.rounds import solve_jointly
 from model.fitting.scale import ScaledBody, check_size
 from model.fitting.scan import Scan, ScanPoints, all_points
@@ -32,7 +32,8 @@ from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.surface import Surface
 from scanprep.judgement import HAND, Judgement, extent, size, unit_problem
 from scanprep.registration.ground import foot_of_vertex, put_on_floor
-from scanprep.skeleton.roles import in_words, joint_in_words
+from scanprep.skeleton.roles import in_words, joint_in_words, part_kind
+from scanprep.skeleton.tree import Skeleton
 from scanprep.threads import one_thread
 
 from .alternation import turns_of
@@ -62,6 +63,7 @@ OUTSIDE, NEARLY_CLOSED = 0.02, 0.01
 # A body inside clothes is searched anew where less than this share of the scan's skin is on it. Of 41 people in seven
 # kinds of clothes it is 0.62 where legs were lost, 0.89 and 0.94 on two right ones, 0.96 and more on the others.
 LEFT_ALONE = 0.95
+CLOSE_ERROR = 0.014                  # metres: clothes as close as skin make girths 22 to 75 mm wider
 BESIDE = 0.04                        # metres from clothes, within which what seems to be skin may be clothes
 MASK = "mask.json"
 UNJUDGED = Judgement.of(check=["no judgement was made"])
@@ -217,10 +219,15 @@ def complete(body: BodyModel | Subject, scan: Scan, landmarks: tuple[np.ndarray,
     if start is not None and config is not None and config.free_scale:
         raise ValueError("start: expected none where the unit of the scan is not known")
     config, report_progress = config or CompletionConfig(), progress or (lambda done, total: None)
+
+    def tell(fitted: Fitted, points: np.ndarray, places: tuple[str, ...]) -> Completion:
+        done = tell_worn(fitted.result, points, places)
+        return widen_errors(done, as_body(body).skeleton, config.tolerance) if CLOSE in places else done
+
     # a mask that is given, or that an earlier result found, is kept
     if start is not None and masked is None and start.not_skin is not None:
-        done = _complete(body, scan, landmarks, config, report_progress, start.not_skin, start).result
-        return tell_worn(done, start.not_skin, start.worn)
+        return tell(_complete(body, scan, landmarks, config, report_progress, start.not_skin, start), start.not_skin,
+                    start.worn)
     first = _complete(body, scan, landmarks, config, report_progress, masked, start)
     if masked is not None or isinstance(scan, DepthPicture):
         return first.result
@@ -229,6 +236,8 @@ def complete(body: BodyModel | Subject, scan: Scan, landmarks: tuple[np.ndarray,
     found = first.find_not_skin(count)
     if found is None:
         return first.result
+    if not found.points.any():
+        return tell(first, found.points, found.places)
     if not config.free_scale:
         found = reach_farther(found, first.fit, first.x, count)
     # the fit goes on from the first pose; where skin is left without a body, as legs under a gown, it is searched anew
@@ -244,15 +253,23 @@ def complete(body: BodyModel | Subject, scan: Scan, landmarks: tuple[np.ndarray,
             break
         found = found.with_more(more, inside.result.predicted, as_body(body).skeleton)
         inside = fit_inside(found.points, inside.result)
-    return tell_worn((first if inside.result.judgement.verdict == "failed" else inside).result, found.points,
-                     found.places)
+    return tell(first if inside.result.judgement.verdict == "failed" else inside, found.points, found.places)
 
 
 def tell_worn(done: Completion, not_skin: np.ndarray, worn: tuple[str, ...]) -> Completion:
     """Add hair and clothes to a completion: points (n,) bool, and words. Each but hair on a head alone is a doubt."""
-    doubts = [f"{words}: the body inside is a guess (--mask with a corrected {MASK})" for words in worn
+    inside = f"the body inside is a guess (--mask with a corrected {MASK})"
+    doubts = [f"{words}: " + ("girths may be 2 to 7 cm less" if words == CLOSE else inside) for words in worn
               if words != "hair on head"]
     return replace(done, not_skin=not_skin, worn=worn, judgement=done.judgement.merge(Judgement.of(None, doubts)))
+
+
+def widen_errors(done: Completion, skeleton: Skeleton, tolerance: float) -> Completion:
+    """Widen the errors under clothes as close as skin: all but head, hands and feet may be farther in than the mesh."""
+    kinds = np.array([part_kind(name) for name in skeleton.names])[skeleton.part_of_vertex(done.predicted)]
+    known = np.zeros(len(kinds)) if done.expected_error is None else done.expected_error
+    error = np.hypot(known, np.where(np.isin(kinds, BARE), 0, CLOSE_ERROR))
+    return replace(done, expected_error=error, confidence=probability_within(error, tolerance))
 
 
 def _complete(body: BodyModel | Subject, scan: Scan, landmarks: tuple[np.ndarray, np.ndarray] | None,

@@ -22,8 +22,8 @@ LEGS, ARMS, BOTH = 0.0054, 0.0060, 0.0102
 SHIN, ANKLE = 0.55, 0.06             # boots begin below this share of a leg's length, and so far above its end, metres
 SOME = 0.003                         # metres: a step that counts once another one is found
 # Cuffs of close suits are askew, so edges across tilted planes are looked for, metres from the wrist, as seen through a
-# narrow and a wider window; metres of both together on either arm. 199 naked people have 0.0199 and 0.0176 at most, 11
-# of 23 suits of 5 to 6 mm have more. No edge at neck or ankles tells the others.
+# narrow and a wider window; metres of both together on either arm. 12 of 23 suits of 5 to 6 mm have more, none of 199
+# naked people, two of 30 very heavy ones. No edge at neck or ankles tells the others.
 CUFF, TILTS, WINDOWS, CUFFS = np.arange(-0.05, 0.01, 0.003), (-0.4, -0.2, 0.0, 0.2, 0.4), (0.014, 0.02), 0.0202
 
 
@@ -91,9 +91,6 @@ def find_hems(template: Mesh, skeleton: Skeleton, kinds: np.ndarray, faces: np.n
         if certain and step > SOME:
             sewn |= np.isin(kinds, trunk)[part]
             sewn |= np.any([limb.along < place for limb, place in zip(ends[end], places, strict=True)], axis=0)
-    cuffs = [find_cuff(limb, template.faces[faces], bary, out_of) for limb in ends["hand"]]
-    if np.min(cuffs, axis=0).sum() > max(CUFFS, 3 * crude):
-        sewn |= np.isin(kinds, ["chest", "abdomen", "upper_arm", "forearm"])[part]
     # boots begin at the shin
     step, places = outward["foot"]
     both = list(zip(ends["foot"], places, strict=True))
@@ -124,10 +121,30 @@ def step_along(limb: Limb, corners: np.ndarray, bary: np.ndarray, out_of: np.nda
     return out
 
 
-def find_cuff(limb: Limb, corners: np.ndarray, bary: np.ndarray, out_of: np.ndarray) -> np.ndarray:
+def step_on_both(steps: Sequence[np.ndarray]) -> tuple[float, tuple[float, float]]:
+    """Find the largest step at about the same ring of both limbs, and its place along each, metres."""
+    size = min(map(len, steps))
+    pairs = np.minimum(steps[0][:size, None], steps[1][None, :size])
+    rings = np.arange(size)
+    pairs[np.abs(rings[:, None] - rings) > SHIFT] = np.nan
+    if not np.isfinite(pairs).any():
+        return 0.0, (0.0, 0.0)
+    best = np.unravel_index(np.nanargmax(pairs), pairs.shape)
+    return float(pairs[best]), (RING * (best[0] + 0.5), RING * (best[1] + 0.5))
+
+
+def has_cuffs(template: Mesh, skeleton: Skeleton, kinds: np.ndarray, faces: np.ndarray, bary: np.ndarray,
+              out_of: np.ndarray, crude: float = 0.0) -> bool:
+    """Return whether both arms end in cuffs of clothes, however close; arguments as of `find_hems`."""
+    arms = find_limbs(template, skeleton, kinds, "hand")
+    edges = np.array([find_edge(limb, template.faces[faces], bary, out_of) for limb in arms])
+    return len(arms) == 2 and bool(edges.min(axis=0).sum() > max(CUFFS, 3 * crude))
+
+
+def find_edge(limb: Limb, corners: np.ndarray, bary: np.ndarray, out_of: np.ndarray) -> np.ndarray:
     """Compute the largest edge inward near the end of an arm, as seen through each window, (2,) metres; 0 without any.
 
-    At an edge the surface goes on with the same slope, but nearer to the bone. `corners` and `bary` as above.
+    At an edge the surface goes on with the same slope, nearer to the bone. `corners` and `bary` as for `step_along`.
     """
     place = np.einsum("nk,nk->n", bary, limb.along[corners]) - limb.length
     on = (np.abs(place) < 0.09) & (np.abs(out_of) < 0.03)
@@ -145,15 +162,3 @@ def find_cuff(limb: Limb, corners: np.ndarray, bary: np.ndarray, out_of: np.ndar
                 lines = np.column_stack([np.ones(len(x)), x, before])
                 found[k] = max(found[k], np.linalg.solve(lines.T @ lines, lines.T @ out_of[seen])[2])
     return found
-
-
-def step_on_both(steps: Sequence[np.ndarray]) -> tuple[float, tuple[float, float]]:
-    """Find the largest step at about the same ring of both limbs, and its place along each, metres."""
-    size = min(map(len, steps))
-    pairs = np.minimum(steps[0][:size, None], steps[1][None, :size])
-    rings = np.arange(size)
-    pairs[np.abs(rings[:, None] - rings) > SHIFT] = np.nan
-    if not np.isfinite(pairs).any():
-        return 0.0, (0.0, 0.0)
-    best = np.unravel_index(np.nanargmax(pairs), pairs.shape)
-    return float(pairs[best]), (RING * (best[0] + 0.5), RING * (best[1] + 0.5))

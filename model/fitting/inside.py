@@ -13,7 +13,7 @@ from scanprep.geometry.geodesics import SurfaceGraph
 from scanprep.skeleton.roles import part_kind
 
 from .confidence import posterior_error
-from .not_skin import NotSkin, Surroundings, describe, split_pieces
+from .not_skin import NotSkin, Surroundings, split_pieces
 from .rounds import solve_jointly
 from .scan import set_apart
 from .scan_fit import ScanData, ScanFit
@@ -66,4 +66,4 @@ def reach_farther(worn: NotSkin, fit: ScanFit, x: np.ndarray, count: int) -> Not
         vertices &= graph.nearest(np.flatnonzero(worn.vertices))[0] < BESIDE
     points = worn.points.copy()
     points[cloud.index[around.points_on(vertices) & ~bare]] = True
-    return NotSkin(vertices, points, describe(around.body, skeleton, vertices, worn.sewn), worn.sewn)
+    return worn.with_more(NotSkin(vertices, points, (), worn.sewn), around.body, skeleton)

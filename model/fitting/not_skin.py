@@ -5,7 +5,8 @@
 3. They reach as far as the scan is out of the body that bare parts tell of (`inside`).
 4. The points on them are masked, and the body is fitted again inside, as with `--mask`.
 
-What is closer than the core and has no hems, such as a suit of 5 mm or short hair, is not told from skin.
+A suit as close as skin is found by its cuffs only, and nothing tells where skin is inside: it is fitted as skin, with
+wider errors. What is closer than the core and has neither hems nor cuffs, such as short hair, is not told from skin.
 """
 from __future__ import annotations
 
@@ -25,7 +26,7 @@ from scanprep.skeleton.roles import in_words, part_kind
 from scanprep.skeleton.tree import Skeleton
 
 from .bodies import FixedBody
-from .hems import find_hems
+from .hems import find_hems, has_cuffs
 from .scan import ScanPoints
 
 # Metres: how far out the core of a piece is, the same at backs and backs of heads, and the rest of it. People differ in
@@ -40,11 +41,12 @@ PIECE, PIECE_CORE = 0.003, 0.0009
 # Scanners close groins and armpits: there skin seems up to three times as far out; it falls off over 8 cm.
 AT_FOLDS, FOLD = 2.0, 0.08
 BORDER = 0.03                        # metres: beside what was not seen, where scanners and smoothing are less exact
+CLOSE = "clothes as close as skin"
 
 
 @dataclass(frozen=True, eq=False)
 class NotSkin:
-    """Hair and clothes on a body."""
+    """Hair and clothes on a body; no vertices and no points under clothes that are as close as skin."""
 
     vertices: np.ndarray            # (N,) bool, of the body
     points: np.ndarray              # (n,) bool, of the scan, as in a mask
@@ -54,7 +56,8 @@ class NotSkin:
     def with_more(self, more: NotSkin, body: Mesh, skeleton: Skeleton) -> NotSkin:
         """Add what was found later."""
         vertices, sewn = self.vertices | more.vertices, self.sewn | more.sewn
-        return NotSkin(vertices, self.points | more.points, describe(body, skeleton, vertices, sewn), sewn)
+        close = (CLOSE,) if CLOSE in self.places + more.places else ()
+        return NotSkin(vertices, self.points | more.points, (*describe(body, skeleton, vertices, sewn), *close), sewn)
 
 
 @dataclass(frozen=True, eq=False)
@@ -132,16 +135,19 @@ def find_not_skin(body: Mesh, person: FixedBody, cloud: ScanPoints, count: int) 
     crude = person.left_out_error or 0.0
     core = np.where(behind, CORE_BEHIND, np.where(belly, CORE_BELLY, CORE))
     far = find_pieces(body, out, np.maximum(core, 3 * crude))
-    sewn, boots = find_hems(person.template, skeleton, kinds, around.near.faces, around.near.bary,
-                            np.where(around.aligned, around.out_of, np.nan), 1.5 * crude)
+    ends = (person.template, skeleton, kinds, around.near.faces, around.near.bary,
+            np.where(around.aligned, around.out_of, np.nan), 1.5 * crude)
+    sewn, boots = find_hems(*ends)
+    # sleeves that end in hems are no close suit
+    close = (CLOSE,) if not sewn[kinds[part] == "upper_arm"].any() and has_cuffs(*ends) else ()
     if not (far | sewn | boots).any():
-        return None
+        return NotSkin(far, np.zeros(count, dtype=bool), close, sewn) if close else None
     loose = reach_the_waist(reach_the_crown(far | sewn | boots, scalp), part, kinds, folds)
     # its points, and those as far out that hang together with them, such as the hem of a skirt; feet below do not
     on_it = around.points_on(loose)
     points = np.zeros(count, dtype=bool)
     points[cloud.index[on_it | find_joined(cloud, on_it, around.out_of > CORE)]] = True
-    return NotSkin(loose, points, describe(body, skeleton, loose, sewn), sewn)
+    return NotSkin(loose, points, (*describe(body, skeleton, loose, sewn), *close), sewn)
 
 
 def find_backs(template: Mesh, part: np.ndarray, kinds: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

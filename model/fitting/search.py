@@ -138,7 +138,7 @@ def find_bodies(model: BodyModel, scan: Mesh | np.ndarray, landmarks: Landmarks 
     if worn is not None:                       # or a limb that was lost
         best = _solve_with_limbs(fit, coarse, starts)[0]
         worn = find_not_skin(fit.mesh(best), body, fit.cloud, point_count(scan))
-    if worn is not None:
+    if worn is not None and worn.points.any():
         worn = reach_farther(worn, fit, best, point_count(scan))
         fit, coarse, starts, factor = _search(body, scan, landmarks or NO_LANDMARKS, config, worn.points)
         best, scan = _solve_with_limbs(fit, coarse, starts)[0], select_points(scan, ~worn.points)
