@@ -7,9 +7,10 @@ import pytest
 
 from completion.mocap.files.markers import MarkerSequence, read_markers
 from completion.mocap.files.motion_files import write_motion_folder
+from completion.mocap.joint_angles import anatomical_angles
 from completion.mocap.marker_sets.layout import MarkerLayout
 from completion.mocap.marker_sets.named import load_layout
-from completion.mocap.pose.coverage import between, find_coverage, marker_labels
+from completion.mocap.pose.coverage import between, find_coverage, find_told_parts, marker_labels, untold_spans
 from completion.motion import Motion
 from model.built_in import load_built_in_model
 
@@ -83,18 +84,38 @@ def test_markers_that_nobody_believes_tell_of_no_part():
     assert found.unseen == ("hand_left",) and found.judgement().verdict == "good"          # a hand is said, no more
 
 
-def test_a_part_between_two_is_told():
-    parents, names = subject().skeleton.parents, NAMES.tolist()
-    hand, head = names.index("hand_left"), names.index("head")
-    chest = names[parents[names.index("upper_arm_left")]]
-    told = set(NAMES[between(subject().skeleton, np.array([hand, head]))])
-    assert told == {"hand_left", "forearm_left", "upper_arm_left", chest, "head"}
-    assert not between(subject().skeleton, np.array([], dtype=int)).any()
+@pytest.mark.parametrize(("seen", "more"), [
+    (("pelvis", "shin_left"), ("thigh_left",)), (("pelvis", "foot_left"), ()),
+    (("pelvis", "head", "upper_arm_left"), ("abdomen", "chest")), (("head",), ()), ((), ())])
+def test_a_part_between_two_is_told_and_a_leg_of_two_links_is_not(seen, more):
+    told = between(subject().skeleton, np.isin(NAMES, seen))
+    assert set(NAMES[told]) == {*seen, *more}
+
+
+def test_gaps_are_bridged_for_a_moment():
+    """At 50 frames a second 10 frames are 0.2 s; longer gaps, and frames before the first marker, are not told."""
+    trusted = np.ones((60, len(LAYOUT.labels)), dtype=bool)
+    lower_leg = np.isin(LAYOUT.labels, ["LTIB", "LKNE", "LANK", "LHEE", "LTOE"])
+    trusted[:5, lower_leg], trusted[10:20, lower_leg], trusted[30:41, lower_leg] = False, False, False
+    motion = Motion(np.zeros((60, len(NAMES), 3)), np.zeros((60, 3)), None, 50.0, np.full(trusted.shape, 0.005),
+                    LAYOUT.labels, trusted=trusted)
+    told = find_told_parts(subject(), LAYOUT, motion)
+    gone = np.isin(NAMES, ["shin_left", "foot_left"])
+    assert told[:, ~gone].all()
+    np.testing.assert_array_equal(np.flatnonzero(~told[:, gone].any(axis=1)), np.r_[0:5, 30:41])
+    (row,) = untold_spans(subject().skeleton, told, 50.0)
+    assert row.value == "; ".join(f"{part} 0.3 s, from 0.60 to 0.82 s" for part in NAMES[gone])
+    assert not untold_spans(subject().skeleton, told[5:30], 50.0)
+    # angles are empty there, and only there
+    centres = subject().joints(motion.poses, motion.trans)
+    angles = anatomical_angles(motion, subject(), centres, told)
+    degrees = dict(zip(angles.names, angles.degrees.T, strict=True))
+    assert np.isnan(degrees["knee_angle_l"]).sum() == 16 and np.isfinite(degrees["knee_angle_r"]).all()
 
 
 def test_angles_that_are_guesses_are_in_no_table(tmp_path):
     found, motion = covered(LEGS)
-    write_motion_folder(tmp_path, motion, subject(), None, found.told)
+    write_motion_folder(tmp_path, motion, subject(), None, find_told_parts(subject(), LAYOUT, motion))
     lines = (tmp_path / "motion.mot").read_text().splitlines()
     head = lines[lines.index("endheader") + 1].split("\t")
     assert "knee_angle_r" in head and "hip_flexion_l" in head and head[1:7] == [

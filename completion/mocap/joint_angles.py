@@ -6,6 +6,7 @@ with its zero, its signs and substitutes for landmarks that a skeleton does not 
 """
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from itertools import product
 
@@ -33,6 +34,13 @@ _MIDDLE = {("pelvis_tilt", "pelvis_list", "pelvis_rotation"): ("ground", "pelvis
 _LIMBS = {"thigh": ("hip", "knee"), "shank": ("knee", "ankle"), "foot": ("ankle", None),
           "humerus": ("shoulder", "elbow"), "forearm": ("elbow", "wrist"), "hand": ("wrist", None)}
 _MIRROR = np.diag([1.0, 1.0, -1.0])  # turns a left joint into the right one that it mirrors
+# Degrees that people reach, with the soft tissue between marker and bone; more is no human pose. Normal ranges of the
+# American Academy of Orthopaedic Surgeons (1965), and 20 to 40 degrees more, as dancers and gymnasts have.
+HUMAN = {"hip_flexion": (-50, 150), "hip_adduction": (-90, 60), "knee_angle": (-20, 170), "ankle_angle": (-80, 60),
+         "elbow_flex": (-20, 170), "wrist_flex": (-110, 110), "lumbar_extension": (-120, 60),
+         "lumbar_bending": (-60, 60), "neck_extension": (-90, 90)}
+# degrees in the middle of what an angle can be, where that is far from 0: arms go forward up and on behind the head
+_CENTRE = {"arm_flex": 60, "arm_add": -60, "forearm_pronation": 90}
 
 
 @dataclass(frozen=True)
@@ -59,6 +67,19 @@ class SegmentAxes:
     parts: dict[str, int]
     frames: dict[str, np.ndarray]
     hips: tuple[int, ...]            # joints whose middle is the position of the pelvis
+    lines: dict[str, tuple[int, int, int]]       # segments along two joints, towards the first, by axis 1 or 2
+
+    def move(self, R: np.ndarray, centres: np.ndarray) -> dict[str, np.ndarray]:
+        """Compute the axes (T, 3, 3) of every segment from part rotations (T, J, 3, 3) and joint centres (T, J, 3).
+
+        The pelvis lies along the line of the hip centres and a limb's segment along that of its two joints, as the
+        rotations of parts answer to the skin around them; the turn about these lines is that of the part.
+        """
+        axes = {name: R[:, part] @ self.frames[name] for name, part in self.parts.items()}
+        for name, (near, far, column) in self.lines.items():
+            line = centres[:, near] - centres[:, far]
+            axes[name] = _swing(axes[name], column, line / np.linalg.norm(line, axis=1, keepdims=True))
+        return axes
 
     def joints(self) -> list[Joint]:
         """Return the joints whose two segments exist."""
@@ -84,11 +105,24 @@ class JointAngles:
     """The joint angles of a motion, and the position of the pelvis, in the axes of the ground."""
 
     names: tuple[str, ...]
-    degrees: np.ndarray              # (T, K)
+    degrees: np.ndarray              # (T, K), NaN where the markers do not determine an angle
     pelvis: np.ndarray               # (T, 3) metres, the middle of the hips
     ground: np.ndarray               # (3, 3) columns: its x, y (up) and z in the axes of the motion
     missing: tuple[str, ...]         # joints of people that this body does not have
-    guessed: tuple[str, ...] = ()    # angles that the markers do not determine, which are left out
+    guessed: tuple[str, ...] = ()    # angles that the markers never determine, which are left out
+
+    def doubts(self) -> tuple[str, ...]:
+        """Return reasons to look: angles that people do not have, with their frames, the longest first."""
+        found = []
+        for name, degrees in zip(self.names, self.degrees.T, strict=True):
+            low, high = HUMAN.get(name.removesuffix("_l").removesuffix("_r"), (-np.inf, np.inf))
+            # degrees of rounding and noise beyond are no news
+            frames = np.flatnonzero((degrees < low - 1) | (degrees > high + 1))
+            if len(frames):
+                worst = degrees[frames[np.abs(degrees[frames] - 0.5 * (low + high)).argmax()]]
+                found.append((len(frames), f"{name} of {worst:.0f} degrees in {len(frames)} frames from {frames[0]} to "
+                              f"{frames[-1]}: people have {low} to {high}, so look at the limb there"))
+        return tuple(reason for _, reason in sorted(found, reverse=True)[:3])
 
 
 def anatomy(names: tuple[str, ...], parents: np.ndarray, joints: np.ndarray) -> SegmentAxes:
@@ -123,7 +157,9 @@ def anatomy(names: tuple[str, ...], parents: np.ndarray, joints: np.ndarray) -> 
         parts["trunk"] = both[0]
     if "skullbase" in roles:
         parts["head"] = roles["skullbase"]
-    frames = dict.fromkeys(parts, body)
+    frames, lines = dict.fromkeys(parts, body), dict[str, tuple[int, int, int]]()
+    if pair[0] == "l_hip":
+        lines["pelvis"] = roles["r_hip"], roles["l_hip"], 2
 
     # limb segments with both joints; the last ones, without a distal joint, have the axes of the rest pose
     for side, (name, (start, end)) in product("rl", _LIMBS.items()):
@@ -132,12 +168,13 @@ def anatomy(names: tuple[str, ...], parents: np.ndarray, joints: np.ndarray) -> 
             continue
         frame = body if name == "foot" else frames.get(f"forearm_{side}")
         if stop is not None:
+            lines[f"{name}_{side}"] = begin, stop, 1
             frame = _long_axes(joints[begin] - joints[stop], body, by_front=start in ("shoulder", "elbow"))
             if name == "forearm":                            # thumbs point forward at rest: midway to pronation
                 frame = frame @ _turn(1, np.pi / 2 if side == "r" else -np.pi / 2)
         if frame is not None:
             parts[f"{name}_{side}"], frames[f"{name}_{side}"] = begin, frame
-    return SegmentAxes(body, parts, frames, tuple(roles[r] for r in ("l_hip", "r_hip") if r in roles))
+    return SegmentAxes(body, parts, frames, tuple(roles[r] for r in ("l_hip", "r_hip") if r in roles), lines)
 
 
 def _long_axes(long: np.ndarray, body: np.ndarray, by_front: bool) -> np.ndarray:
@@ -153,7 +190,7 @@ def anatomical_angles(motion: Motion, subject: Subject, centres: np.ndarray, tol
                       ) -> JointAngles:
     """Compute the joint angles of a person in motion, whose joints are at `centres` (T, J, 3), metres.
 
-    With `told` (J,) bool, only angles between parts that the markers determine.
+    With `told` (T, J) bool, only angles between parts that the markers determine; others are NaN.
 
     Raises
     ------
@@ -164,15 +201,26 @@ def anatomical_angles(motion: Motion, subject: Subject, centres: np.ndarray, tol
     segments = anatomy(skeleton.names, skeleton.parents, rest_joints(subject))
     R = skeleton.part_rotations(motion.poses)
     ground = ground_axes(segments.axes, R[:, segments.parts["pelvis"]])
-    degrees = angles_of(segments, ground, R)
+    degrees = angles_of(segments, ground, segments.move(R, centres))
     pelvis = centres[:, list(segments.hips or (segments.parts["pelvis"],))].mean(axis=1) @ ground
-    # separate determined angles from guessed ones
+    # an angle is determined in the frames that tell of both its segments
     joints = segments.joints()
-    known = [told is None or all(told[segments.parts[segment]] for segment in (joint.proximal, joint.distal)
-                                 if segment != "ground") for joint in joints]
-    names, guessed = (tuple(name for joint, is_known in zip(joints, known, strict=True) if is_known == wanted
-                            for name in joint.angles) for wanted in (True, False))
-    return JointAngles(names, degrees[:, np.repeat(known, 3)], pelvis, ground, segments.missing(), guessed)
+    names = [name for joint in joints for name in joint.angles]
+    for k, joint in enumerate(joints):
+        ends = [segments.parts[one] for one in (joint.proximal, joint.distal) if one != "ground"]
+        if told is not None:
+            degrees[~told[:, ends].all(axis=1), 3 * k:3 * k + 3] = np.nan
+    known = np.isfinite(degrees).any(axis=0)
+    determined, guessed = (tuple(np.array(names)[some].tolist()) for some in (known, ~known))
+    return JointAngles(determined, degrees[:, known], pelvis, ground, segments.missing(), guessed)
+
+
+def angle_doubts(motion: Motion, subject: Subject, told: np.ndarray) -> tuple[str, ...]:
+    """Return the doubts of the joint angles that `told` (T, J) bool determines; none of a body that is no person's."""
+    try:
+        return anatomical_angles(motion, subject, subject.joints(motion.poses, motion.trans), told).doubts()
+    except ValueError:
+        return ()
 
 
 def rest_joints(subject: Subject) -> np.ndarray:
@@ -180,21 +228,18 @@ def rest_joints(subject: Subject) -> np.ndarray:
     return subject.joints(np.zeros((len(subject.skeleton.parents), 3)))
 
 
-def angles_of(found: SegmentAxes, ground: np.ndarray, R: np.ndarray) -> np.ndarray:
-    """Compute joint angles (T, K), degrees, from part rotations (T, J, 3, 3), three for each joint in order."""
+def angles_of(found: SegmentAxes, ground: np.ndarray, axes: Mapping[str, np.ndarray]) -> np.ndarray:
+    """Compute joint angles (T, K), degrees, from the axes (T, 3, 3) of each segment, three for each joint in order."""
     columns = []
     for joint in found.joints():
-        relative = _axes_of(found, ground, R, joint.proximal).swapaxes(1, 2) @ _axes_of(found, ground, R, joint.distal)
+        proximal = ground[None] if joint.proximal == "ground" else axes[joint.proximal]
+        relative = proximal.swapaxes(1, 2) @ axes[joint.distal]
         if joint.mirrored:
             relative = _MIRROR @ relative @ _MIRROR
-        columns.append(np.array(joint.signs) * decompose(relative, joint.sequence))
+        turns = np.array(joint.signs) * decompose(relative, joint.sequence, joint.distal.startswith("humerus"))
+        centre = np.radians([_CENTRE.get(name[:-2], 0) for name in joint.angles])
+        columns.append(unwrap_whole(turns, relative) if joint.proximal == "ground" else wrap(turns, centre))
     return np.degrees(np.concatenate(columns, axis=1))
-
-
-def _axes_of(found: SegmentAxes, ground: np.ndarray, R: np.ndarray, segment: str) -> np.ndarray:
-    """Compute the axes (T, 3, 3) of a segment, or of the ground, in the world."""
-    return np.broadcast_to(ground, R[:, 0].shape) if segment == "ground" else \
-        R[:, found.parts[segment]] @ found.frames[segment]
 
 
 def ground_axes(axes: np.ndarray, R: np.ndarray) -> np.ndarray:
@@ -217,11 +262,12 @@ def _nearest_axis(direction: np.ndarray) -> np.ndarray:
     return np.eye(3)[main] * np.sign(direction[main])
 
 
-def decompose(R: np.ndarray, sequence: str) -> np.ndarray:
+def decompose(R: np.ndarray, sequence: str, beyond: bool = False) -> np.ndarray:
     """Decompose rotations R (T, 3, 3) into angles (T, 3), radians, about the axes of a sequence, "zxy" or "yxy".
 
-    R = R_1(a) R_2(b) R_3(c). For "yxy", -b is between 0 and half a turn, as in ISB. "zxy" has two solutions: smaller
-    angles are taken, unless that makes a jump. No angle jumps by a full turn. In gimbal lock, a stays as it was.
+    R = R_1(a) R_2(b) R_3(c). For "yxy", -b is between 0 and half a turn, as in ISB. For "zxy", b is within a quarter of
+    a turn; `beyond` that, as an arm that is raised sideways goes, it continues without a jump where that is the smaller
+    change. In gimbal lock, a stays as it was.
     """
     if sequence == "zxy":
         lost = np.hypot(R[:, 0, 1], R[:, 1, 1])
@@ -234,7 +280,22 @@ def decompose(R: np.ndarray, sequence: str) -> np.ndarray:
     a = np.where(known < 0, 0.0, a[known])
     left = _turn(0, -b) @ _turn(2 if sequence == "zxy" else 1, -a) @ R
     angles = np.stack([a, b, np.arctan2(left[:, 0, 2], left[:, 0, 0])], axis=1)
-    return np.unwrap(_smaller(angles) if sequence == "zxy" else angles, axis=0)
+    return _smaller(angles) if beyond and sequence == "zxy" else angles
+
+
+def wrap(angles: np.ndarray, centre: np.ndarray | float = 0.0) -> np.ndarray:
+    """Bring angles, radians, within half a turn of `centre`, as no joint of people has more."""
+    return centre + np.pi - (np.pi - (angles - centre)) % (2 * np.pi)
+
+
+def unwrap_whole(angles: np.ndarray, R: np.ndarray) -> np.ndarray:
+    """Let angles (T, 3), radians, of a body that turns round go on beyond half a turn, while R (T, 3, 3) is continuous.
+
+    Where it turns by more than a third of a turn from frame to frame they begin anew, within half a turn.
+    """
+    turned = rotations.log(R[1:] @ R[:-1].swapaxes(1, 2))
+    breaks = np.flatnonzero(np.linalg.norm(turned, axis=1) > 2 * np.pi / 3) + 1
+    return np.concatenate([np.unwrap(some, axis=0) for some in np.split(wrap(angles), breaks)])
 
 
 def _smaller(angles: np.ndarray) -> np.ndarray:
@@ -255,6 +316,14 @@ def _smaller(angles: np.ndarray) -> np.ndarray:
     for t in range(len(angles) - 1, -1, -1):
         out[t], state = both[state, t], came[t, state]
     return out
+
+
+def _swing(axes: np.ndarray, column: int, line: np.ndarray) -> np.ndarray:
+    """Turn axes (T, 3, 3) the shortest way so that a column lies along unit vectors (T, 3)."""
+    across = np.cross(axes[:, :, column], line)
+    sine, cosine = np.linalg.norm(across, axis=1), np.einsum("td,td->t", axes[:, :, column], line)
+    angle = np.arctan2(sine, cosine) / np.maximum(sine, 1e-12)
+    return np.asarray(rotations.exp(angle[:, None] * across) @ axes)
 
 
 def _turn(axis: int, angle: np.ndarray | float) -> np.ndarray:

@@ -31,10 +31,11 @@ from ...motion_pictures import (
 from ..files.markers import MarkerSequence, read_markers
 from ..files.motion_files import write_glb, write_motion_folder
 from ..files.opensim import remove_distrusted
+from ..joint_angles import angle_doubts
 from ..labelling.labelled_file import label_first, show_labels
 from ..marker_sets.layout import MarkerLayout
 from ..marker_sets.named import choose_layout
-from ..pose.coverage import find_coverage
+from ..pose.coverage import find_coverage, find_told_parts, untold_spans
 from ..pose.follow import AnimateConfig, animate
 from ..pose.judgement import judge_motions, markers_told, motion_doubts, motion_problem
 from ..retargeting.retarget import morph_vertices, retarget
@@ -118,13 +119,15 @@ class AnimateTask:
             layout.save(output / "layout.json")
         # what the markers determine, and a judgement of labels, motion, markers and person
         covered = find_coverage(body, layout, [motion], [sequence])
+        told = find_told_parts(body, layout, motion)
         moving = Judgement.of(motion_problem(motion, body.template, layout, sequence),
-                              motion_doubts([motion], [sequence], body.template))
+                              motion_doubts([motion], [sequence], body.template) + angle_doubts(motion, body, told))
         judgement = covered.judgement().merge(labelling, moving, misplaced.judgement(sequence.labels), placed)
         if fit is not None:
             judgement = judge_motions(person_judgement(self.model, fit.betas), judgement, [motion], body.template)
-        metrics = [judgement_row(judgement), *metrics, *covered.metrics(), *motion_figures(motion)]
-        write_motion_folder(output, motion, body, remove_distrusted(motion, sequence), covered.told)
+        metrics = [judgement_row(judgement), *metrics, *covered.metrics(),
+                   *untold_spans(body.skeleton, told, motion.rate), *motion_figures(motion)]
+        write_motion_folder(output, motion, body, remove_distrusted(motion, sequence), told)
         metrics += write_glb(output / "animation.glb", motion, body)
         page = motion_page(motion, body, sequence, path.name, metrics)
         if self.unlabelled:

@@ -90,13 +90,13 @@ def write_motion_folder(folder: Path, motion: Motion, subject: Subject, markers:
                         told: np.ndarray | None = None) -> None:
     """Write motion.npz, .bvh, .trc and .mot, joint_angles.csv, joint_centres.csv, and residuals.csv if there are any.
 
-    `markers`, of as many frames, go into the TRC. Values between parts that the markers do not determine (`told` (J,)
-    bool) are empty cells in tables and left out of the MOT.
+    `markers`, of as many frames, go into the TRC. Values between parts that the markers do not determine (`told` (T,
+    J) bool) are empty cells in tables.
     """
     skeleton, T, centres = subject.skeleton, len(motion.poses), joint_centres(motion, subject)
     names, angles = skeleton.names, joint_angles(motion)
     if told is not None:
-        angles[:, ~(told & told[np.maximum(skeleton.parents, 0)])] = np.nan     # unknown if either side is
+        angles[~(told & told[:, np.maximum(skeleton.parents, 0)])] = np.nan     # unknown if either side is
     motion.save(folder / "motion.npz")
     write_motion_bvh(folder / "motion.bvh", motion, subject)
     write_numbers(folder / "joint_angles.csv", ["time", *(f"{name}_r{axis}" for name in names for axis in "xyz")],

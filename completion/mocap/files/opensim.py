@@ -26,7 +26,7 @@ def write_opensim(folder: Path, motion: Motion, subject: Subject, centres: np.nd
                   markers: MarkerSequence | None = None, told: np.ndarray | None = None) -> None:
     """Write motion.trc with markers, if any, and joint centres (T, J, 3), metres; motion.mot for a person's body.
 
-    Centres and angles between parts that the markers do not determine (`told` (J,) bool) are left out.
+    Centres and angles between parts that the markers do not determine (`told` (T, J) bool) are empty cells.
     """
     points = centre_sequence(mask_unknown_centres(centres, subject.skeleton, told), subject.skeleton, motion.rate)
     try:
@@ -74,10 +74,10 @@ def centre_sequence(centres: np.ndarray, skeleton: Skeleton, rate: float) -> Mar
 
 
 def mask_unknown_centres(centres: np.ndarray, skeleton: Skeleton, told: np.ndarray | None) -> np.ndarray:
-    """Set joint centres (T, J, 3) between two undetermined parts to NaN; `told` (J,) are the others."""
+    """Set joint centres (T, J, 3) between two undetermined parts to NaN; `told` (T, J) are the others."""
     if told is None:
         return centres
-    return np.where((told | told[np.maximum(skeleton.parents, 0)])[:, None], centres, np.nan)
+    return np.where((told | told[:, np.maximum(skeleton.parents, 0)])[..., None], centres, np.nan)
 
 
 def centre_labels(skeleton: Skeleton) -> tuple[str, ...]:

@@ -29,10 +29,11 @@ from ..artefacts.results import artefact_table, write_virtual
 from ..files.markers import MarkerSequence, read_markers
 from ..files.motion_files import joint_centres, write_glb, write_motion_folder, write_residuals
 from ..files.opensim import centre_sequence, mask_unknown_centres
+from ..joint_angles import angle_doubts
 from ..labelling.labelled_file import label_first, show_labels
 from ..marker_sets.layout import MarkerLayout
 from ..marker_sets.named import choose_layout
-from ..pose.coverage import Coverage, find_coverage
+from ..pose.coverage import Coverage, find_coverage, find_told_parts, untold_spans
 from ..pose.judgement import judge_motions, markers_told, motion_doubts, motion_problem
 from ..retargeting.retarget import retarget
 from ..retargeting.soft_tissue import picture_transfer, retarget_soft_tissue, write_character
@@ -138,13 +139,19 @@ class _Found:
         return find_coverage(self.takes[0].subject, self.result.layout, [take.motion for take in self.takes],
                              [take.markers for take in self.takes])
 
+    def told(self, take: Take) -> np.ndarray:
+        """Find in which frames the markers determine which parts, (T, J) bool."""
+        return find_told_parts(take.subject, self.result.layout, take.motion)
+
     def judgement(self, takes: Sequence[Take]) -> Judgement:
         """Judge the person and the motions of some sequences."""
         body, result, several = self.model.template, self.result, len(takes) > 1
         motions = [take.motion for take in takes]
         problems = [(f"{take.name}: " if several else "") + why for take in takes if (why := motion_problem(
             take.motion, take.subject.template, result.layout, take.markers))]
-        moving = Judgement.of(problems, motion_doubts(motions, [take.markers for take in takes], body))
+        angles = tuple((f"{take.name}: " if several else "") + why for take in takes
+                       for why in angle_doubts(take.motion, take.subject, self.told(take)))
+        moving = Judgement.of(problems, motion_doubts(motions, [take.markers for take in takes], body) + angles)
         own = self.covered.judgement().merge(self.labelling, moving, result.misplaced.judgement(self.usual.labels),
                                              result.person.judgement(self.usual))
         return judge_motions(self.person, own, motions, body)
@@ -229,7 +236,8 @@ def _write(work: MoshTask, found: _Found, take: Take, context: TaskContext, sett
         outcome = Outcome(place(folder), metrics, settings, judgement=judgement)
         write_report(outcome, work.command, time.perf_counter() - start)
 
-    determined = found.covered.told
+    determined = found.told(take)
+    metrics += untold_spans(take.subject.skeleton, determined, take.motion.rate)
     metrics += context.files(f"{take.name} files",
                              (solved, determined, take.source.path, take.source.who, take.unit, factor),
                              lambda folder: write_take(place(folder), take, determined, factor))
@@ -246,7 +254,7 @@ def _write(work: MoshTask, found: _Found, take: Take, context: TaskContext, sett
 def write_take(folder: Path, take: Take, told: np.ndarray | None = None, factor: float = 1.0) -> list[Metric]:
     """Write all files of a sequence but its page; exaggerated.glb only for a factor on soft tissue other than 1.
 
-    Angles and joint centres between parts that the markers do not determine (`told` (J,) bool) are left out.
+    Angles and joint centres between parts that the markers do not determine (`told` (T, J) bool) are empty cells.
     Returned is the distance of the GLB files from the exact bodies.
     """
     motion, body, soft = take.motion, take.subject, take.soft

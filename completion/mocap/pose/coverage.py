@@ -10,7 +10,6 @@ import numpy as np
 from model.linear import Subject
 from scanprep.console import Metric
 from scanprep.judgement import Judgement
-from scanprep.skeleton.roles import above
 from scanprep.skeleton.tree import Skeleton
 
 from ...motion import Motion
@@ -19,6 +18,7 @@ from ..marker_sets.layout import MarkerLayout
 
 # points that Plug-in Gait computes: centres of mass, and for every segment its origin and the ends of three axes
 COMPUTED, AXES = r"CentreOfMass(Floor)?", "OALP"             # PELO, PELA, PELL, PELP of the pelvis
+BRIDGED = 0.2                        # seconds without markers over which the motion before and after tells of a part
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,7 +32,7 @@ class Coverage:
     count : int
         Markers of the recordings: their `marker_labels`, without those that are hardly ever seen.
     told : (J,) bool
-        Parts that carry a marker or lie between two that do; the poses of the others are guesses.
+        Parts that are told in some frame, as `find_told_parts` says; the poses of the others are guesses.
     parts : tuple of str
         Names of the parts that carry a marker.
     unseen : tuple of str
@@ -95,11 +95,11 @@ def find_coverage(subject: Subject, layout: MarkerLayout, motions: Sequence[Moti
     lasting = {label for one in markers for label, share in zip(one.labels, one.seen.mean(axis=0), strict=True)
                if share >= 0.1 and label in marker_labels(one.labels)}
     doubted = {label for motion in motions for label in motion.distrusted}
-    # parts with a trusted marker, and those between two of them
+    # parts with a trusted marker, and those that follow from them
     known = {layout.aliases.get(label, label) for label in used - doubted}
     part_of_marker = skeleton.part_of_vertex(body)[layout.nearest]
     seen = np.unique(part_of_marker[np.isin(layout.labels, sorted(known))])
-    told = between(skeleton, seen)
+    told = np.any([find_told_parts(subject, layout, motion).any(axis=0) for motion in motions], axis=0)
     area = np.bincount(skeleton.part_of_face, body.face_areas, minlength=len(told))
     names = np.array(skeleton.names)
     return Coverage(tuple(sorted(used)), len(lasting | used), told, tuple(names[seen].tolist()),
@@ -122,13 +122,49 @@ def marker_labels(labels: Iterable[str]) -> set[str]:
     return {label for label in every - axes if not re.fullmatch(f"{unnamed}|{COMPUTED}", label.rpartition(":")[2])}
 
 
+def find_told_parts(subject: Subject, layout: MarkerLayout, motion: Motion) -> np.ndarray:
+    """Find in which frames the markers determine which parts of a body, (T, J) bool.
+
+    A part is told by a trusted marker of its own, over short gaps too, and where `between` says so. Distrusted markers
+    determine nothing.
+    """
+    skeleton = subject.skeleton
+    columns, known = layout.match_columns(motion.labels, 0)
+    doubted = np.isin(np.array(motion.labels, dtype=object)[columns], motion.distrusted)
+    trusted = motion.trusted[:, columns] & ~doubted
+    part = skeleton.part_of_vertex(subject.template)[known.nearest]
+    seen = np.stack([trusted[:, part == p].any(axis=1) for p in range(len(skeleton.parents))], axis=1)
+    # frames in a gap that is short
+    frames, T = np.arange(len(seen))[:, None], len(seen)
+    before = np.maximum.accumulate(np.where(seen, frames, -T), axis=0)
+    after = np.minimum.accumulate(np.where(seen, frames, 2 * T)[::-1], axis=0)[::-1]
+    seen |= (after - before - 1) / motion.rate <= BRIDGED
+    rows, row = np.unique(seen, axis=0, return_inverse=True)
+    return np.stack([between(skeleton, one) for one in rows])[row.ravel()]
+
+
 def between(skeleton: Skeleton, seen: np.ndarray) -> np.ndarray:
-    """Return a mask (J,) of some parts (n,) and all parts between them in the tree."""
-    found, ways = np.zeros(len(skeleton.parents), dtype=bool), [above(skeleton.parents, part) for part in seen.tolist()]
-    if not ways:
-        return found
-    # from every part up to the first ancestor that all have in common
-    top = next(part for part in ways[0] if all(part in way for way in ways))
-    for way in ways:
-        found[way[:way.index(top) + 1]] = True
-    return found
+    """Add to some parts (J,) bool those with two neighbours among them, which determine what is between.
+
+    Two links of a limb in a row, as thigh and shank without markers, are not: a knee may bend either way.
+    """
+    told, parents = seen.copy(), np.asarray(skeleton.parents)
+    child = np.flatnonzero(parents >= 0)
+    while True:
+        count = np.bincount(child, told[parents[child]], len(told)) + np.bincount(parents[child], told[child],
+                                                                                 len(told))
+        more = told | (count >= 2)
+        if (more == told).all():
+            return told
+        told = more
+
+
+def untold_spans(skeleton: Skeleton, told: np.ndarray, rate: float) -> list[Metric]:
+    """Return the row of parts that some frames of (T, J) bool do not tell, with their longest span, if there is one."""
+    rows = []
+    for name, column in zip(skeleton.names, told.T, strict=True):
+        if column.any() and not column.all():
+            edges = np.flatnonzero(np.diff(np.concatenate([[True], column, [True]]).astype(int)))
+            begin, end = max(edges.reshape(-1, 2).tolist(), key=lambda span: span[1] - span[0])
+            rows.append(f"{name} {(~column).sum() / rate:.1f} s, from {begin / rate:.2f} to {end / rate:.2f} s")
+    return [Metric("not seen for a time, empty cells there", "; ".join(rows))] if rows else []
