@@ -110,6 +110,7 @@ class JointAngles:
     ground: np.ndarray               # (3, 3) columns: its x, y (up) and z in the axes of the motion
     missing: tuple[str, ...]         # joints of people that this body does not have
     guessed: tuple[str, ...] = ()    # angles that the markers never determine, which are left out
+    errors: np.ndarray | None = None         # (T, K) degrees, expected, root mean square, NaN as the angles
 
     def doubts(self) -> tuple[str, ...]:
         """Return reasons to look: angles that people do not have, with their frames, the longest first."""
@@ -186,11 +187,12 @@ def _long_axes(long: np.ndarray, body: np.ndarray, by_front: bool) -> np.ndarray
     return np.stack([kept, y, np.cross(kept, y)] if by_front else [np.cross(y, kept), y, kept], axis=1)
 
 
-def anatomical_angles(motion: Motion, subject: Subject, centres: np.ndarray, told: np.ndarray | None = None
-                      ) -> JointAngles:
+def anatomical_angles(motion: Motion, subject: Subject, centres: np.ndarray, told: np.ndarray | None = None,
+                      errors: np.ndarray | None = None) -> JointAngles:
     """Compute the joint angles of a person in motion, whose joints are at `centres` (T, J, 3), metres.
 
-    With `told` (T, J) bool, only angles between parts that the markers determine; others are NaN.
+    With `told` (T, J) bool, only angles between parts that the markers determine; others are NaN. `errors` are those of
+    `expect_angle_errors`, if known.
 
     Raises
     ------
@@ -212,7 +214,9 @@ def anatomical_angles(motion: Motion, subject: Subject, centres: np.ndarray, tol
             degrees[~told[:, ends].all(axis=1), 3 * k:3 * k + 3] = np.nan
     known = np.isfinite(degrees).any(axis=0)
     determined, guessed = (tuple(np.array(names)[some].tolist()) for some in (known, ~known))
-    return JointAngles(determined, degrees[:, known], pelvis, ground, segments.missing(), guessed)
+    if errors is not None:
+        errors = np.where(np.isfinite(degrees), errors, np.nan)[:, known]
+    return JointAngles(determined, degrees[:, known], pelvis, ground, segments.missing(), guessed, errors)
 
 
 def angle_doubts(motion: Motion, subject: Subject, told: np.ndarray) -> tuple[str, ...]:

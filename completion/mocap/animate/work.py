@@ -28,6 +28,7 @@ from ...motion_pictures import (
     pane_with_dots,
     worst_frames,
 )
+from ..angle_errors import expect_angle_errors
 from ..files.markers import MarkerSequence, read_markers
 from ..files.motion_files import write_glb, write_motion_folder
 from ..files.opensim import remove_distrusted
@@ -127,7 +128,8 @@ class AnimateTask:
             judgement = judge_motions(person_judgement(self.model, fit.betas), judgement, [motion], body.template)
         metrics = [judgement_row(judgement), *metrics, *covered.metrics(),
                    *untold_spans(body.skeleton, told, motion.rate), *motion_figures(motion)]
-        write_motion_folder(output, motion, body, remove_distrusted(motion, sequence), told)
+        write_motion_folder(output, motion, body, remove_distrusted(motion, sequence), told,
+                            expect_angle_errors(motion, body, layout, sequence))
         metrics += write_glb(output / "animation.glb", motion, body)
         page = motion_page(motion, body, sequence, path.name, metrics)
         if self.unlabelled:

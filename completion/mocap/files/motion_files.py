@@ -87,11 +87,11 @@ def joint_centres(motion: Motion, subject: Subject) -> np.ndarray:
 
 
 def write_motion_folder(folder: Path, motion: Motion, subject: Subject, markers: MarkerSequence | None = None,
-                        told: np.ndarray | None = None) -> None:
-    """Write motion.npz, .bvh, .trc and .mot, joint_angles.csv, joint_centres.csv, and residuals.csv if there are any.
+                        told: np.ndarray | None = None, errors: np.ndarray | None = None) -> None:
+    """Write motion.npz, .bvh, .trc and .mot, tables of joint angles and centres, and residuals.csv if there are any.
 
     `markers`, of as many frames, go into the TRC. Values between parts that the markers do not determine (`told` (T,
-    J) bool) are empty cells in tables.
+    J) bool) are empty cells in tables. `errors` are those of the joint angles, from `expect_angle_errors`.
     """
     skeleton, T, centres = subject.skeleton, len(motion.poses), joint_centres(motion, subject)
     names, angles = skeleton.names, joint_angles(motion)
@@ -103,7 +103,7 @@ def write_motion_folder(folder: Path, motion: Motion, subject: Subject, markers:
                   np.c_[motion.times, angles.reshape(T, -1)])
     write_numbers(folder / "joint_centres.csv", ["time", *(f"{name}_{axis}" for name in names for axis in "xyz")],
                   np.c_[motion.times, mask_unknown_centres(centres, skeleton, told).reshape(T, -1)])
-    write_opensim(folder, motion, subject, centres, markers, told)
+    write_opensim(folder, motion, subject, centres, markers, told, errors)
     if motion.labels:
         write_residuals(folder / "residuals.csv", motion)
 

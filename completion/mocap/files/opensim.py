@@ -1,6 +1,6 @@
 """OpenSim files of a motion: motion.trc with markers and joint centres, motion.mot with joint angles.
 
-Both are in the axes of OpenSim's ground: y up, x where the person faces. Each of these is an axis of the recording, so
+The angles are in anatomical_angles.csv too, with their expected errors. Files for OpenSim are in the axes of OpenSim's ground: y up, x where the person faces. Each of these is an axis of the recording, so
 numbers only change places and signs.
 """
 from __future__ import annotations
@@ -23,14 +23,15 @@ from .markers import MarkerSequence, write_markers
 
 
 def write_opensim(folder: Path, motion: Motion, subject: Subject, centres: np.ndarray,
-                  markers: MarkerSequence | None = None, told: np.ndarray | None = None) -> None:
-    """Write motion.trc with markers, if any, and joint centres (T, J, 3), metres; motion.mot for a person's body.
+                  markers: MarkerSequence | None = None, told: np.ndarray | None = None,
+                  errors: np.ndarray | None = None) -> None:
+    """Write motion.trc with markers, if any, and joint centres (T, J, 3), metres; joint angles for a person's body.
 
     Centres and angles between parts that the markers do not determine (`told` (T, J) bool) are empty cells.
     """
     points = centre_sequence(mask_unknown_centres(centres, subject.skeleton, told), subject.skeleton, motion.rate)
     try:
-        angles = anatomical_angles(motion, subject, centres, told)
+        angles = anatomical_angles(motion, subject, centres, told, errors)
     except ValueError as error:
         say(f"motion.mot is not written: {error}")
         # without a person's parts the ground follows from how the body stands
@@ -41,6 +42,7 @@ def write_opensim(folder: Path, motion: Motion, subject: Subject, centres: np.nd
         if angles.missing:
             say(f"motion.mot has no angles of {', '.join(angles.missing)}, for which this body has no parts")
         write_mot(folder / "motion.mot", angles, motion.rate)
+        write_angles(folder / "anatomical_angles.csv", angles, motion.rate)
     # markers first, then joint centres with other labels
     labels, positions, rate = points.labels, points.positions, motion.rate
     if markers is not None:
@@ -87,6 +89,18 @@ def centre_labels(skeleton: Skeleton) -> tuple[str, ...]:
     taken = [sided.get(j, f"{name}_joint") for j, name in enumerate(skeleton.names)][1:]
     return tuple(label if taken.count(label) == 1 else f"{skeleton.names[j]}_joint{j}"
                  for j, label in enumerate(taken, start=1))
+
+
+def write_angles(path: Path, angles: JointAngles, rate: float) -> None:
+    """Write joint angles in degrees as CSV, each beside its expected error, NAME_sd; empty where not determined."""
+    columns, names = [np.arange(len(angles.degrees)) / rate], ["time"]
+    for k, name in enumerate(angles.names):
+        columns.append(angles.degrees[:, k])
+        names.append(name)
+        if angles.errors is not None:
+            columns.append(angles.errors[:, k])
+            names.append(f"{name}_sd")
+    storage.write_file(path, tables.number_table(names, np.stack(columns, axis=1)))
 
 
 def write_mot(path: str | Path, angles: JointAngles, rate: float) -> None:

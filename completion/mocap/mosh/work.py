@@ -25,6 +25,7 @@ from scanprep.pictures.camera import guess_upright
 from scanprep.pictures.sheets import save_png
 
 from ...motion_pictures import picture_bodies
+from ..angle_errors import expect_angle_errors
 from ..artefacts.results import artefact_table, write_virtual
 from ..files.markers import MarkerSequence, read_markers
 from ..files.motion_files import joint_centres, write_glb, write_motion_folder, write_residuals
@@ -240,7 +241,7 @@ def _write(work: MoshTask, found: _Found, take: Take, context: TaskContext, sett
     metrics += untold_spans(take.subject.skeleton, determined, take.motion.rate)
     metrics += context.files(f"{take.name} files",
                              (solved, determined, take.source.path, take.source.who, take.unit, factor),
-                             lambda folder: write_take(place(folder), take, determined, factor))
+                             lambda folder: write_take(place(folder), take, found.result.layout, determined, factor))
     shown: list[Any] = []
     if (body := work.character) is not None:
         *shown, exact = context.files(f"{take.name} character", (solved, body, factor),
@@ -251,14 +252,16 @@ def _write(work: MoshTask, found: _Found, take: Take, context: TaskContext, sett
     return metrics, clocks() - start
 
 
-def write_take(folder: Path, take: Take, told: np.ndarray | None = None, factor: float = 1.0) -> list[Metric]:
+def write_take(folder: Path, take: Take, layout: MarkerLayout, told: np.ndarray | None = None, factor: float = 1.0
+               ) -> list[Metric]:
     """Write all files of a sequence but its page; exaggerated.glb only for a factor on soft tissue other than 1.
 
     Angles and joint centres between parts that the markers do not determine (`told` (T, J) bool) are empty cells.
     Returned is the distance of the GLB files from the exact bodies.
     """
     motion, body, soft = take.motion, take.subject, take.soft
-    write_motion_folder(folder, motion, body, take.artefacts.virtual(), told)
+    write_motion_folder(folder, motion, body, take.artefacts.virtual(), told,
+                        expect_angle_errors(motion, body, layout, take.markers))
     exact = write_glb(folder / "animation.glb", take.shown, body, None if soft is None else take.make)
     if soft is not None:
         soft.save(folder / "soft_tissue.npz")
