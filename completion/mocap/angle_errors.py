@@ -1,4 +1,4 @@
-"""Expected errors of joint angles, from what the markers leave open: the posterior of the fit, carried to the angles."""
+"""Expected errors of joint angles: what the markers leave open in the fit, carried to the angles."""
 from __future__ import annotations
 
 import numpy as np
@@ -12,7 +12,7 @@ from .joint_angles import SegmentAxes, anatomy, angles_of, ground_axes, rest_joi
 from .marker_sets.layout import MarkerLayout
 from .pose.marked_body import MarkedBody
 
-EVERY, AROUND = 0.05, 2              # seconds between frames that are computed, and how many of these tell of each other
+EVERY, AROUND = 0.05, 2              # seconds between computed frames, and how many of these tell of each other
 WEAK = 0.003                         # weight of the pose prior: so weak that only markers determine an angle
 LEAST = 0.004                        # metres: markers are no more exact than soft tissue
 # Errors of markers on one segment go together, so a segment has fewer than it has markers. Degrees by which angles of a

@@ -134,7 +134,8 @@ def write_results(work: CompletionTask, inputs: CompletionInputs, files: ScanFil
     name = ", ".join(path.name for path in inputs.scans)
     panes = completion_panes(views, done, work.body.template, masked, landmarks,
                              {vertex: name for name, vertex in work.marks.items()})
-    completion_page(panes, name, metrics, picture, masked is not None and bool(masked.any())).write(output / "report.html")
+    hidden = masked is not None and bool(masked.any())
+    completion_page(panes, name, metrics, picture, hidden).write(output / "report.html")
     if work.command:
         storage.write_file(output / SCENE, small_scene(panes))
     return metrics

@@ -1,7 +1,8 @@
 """OpenSim files of a motion: motion.trc with markers and joint centres, motion.mot with joint angles.
 
-The angles are in anatomical_angles.csv too, with their expected errors. Files for OpenSim are in the axes of OpenSim's ground: y up, x where the person faces. Each of these is an axis of the recording, so
-numbers only change places and signs.
+The angles are in anatomical_angles.csv too, with their expected errors. Files for OpenSim are in the axes of its
+ground: y up, x where the person faces. Each of these is an axis of the recording, so numbers only change places and
+signs.
 """
 from __future__ import annotations
 

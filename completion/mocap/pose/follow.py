@@ -13,6 +13,7 @@ from ...motion import Motion, Progress
 from ..files.markers import MarkerSequence
 from ..marker_sets.layout import MarkerLayout
 from .foot_contact import FootContact
+from .hinges import Hinges
 from .initialise import reinitialise_frames, search_pose
 from .marked_body import AnimateConfig, MarkedBody, judge_markers, marker_weights
 from .stream import STEPS, MarkerTracker
@@ -125,7 +126,7 @@ def follow_whole(body: MarkedBody, targets: np.ndarray, rate: float, config: Ani
     """
     T, stiffness = len(targets), config.inertia(rate, body.n_unknowns)
     x = between_keys(body, targets, rate, config) if start is None else start.copy()
-    moved, feet, inside = np.zeros(T), None, span_with_markers(targets)
+    moved, feet, inside, hinges = np.zeros(T), None, span_with_markers(targets), Hinges(body)
     free = max(config.smoothing, 1)
     rounds = free + 2 * (config.ground and T > 2)                       # two more rounds with foot contact
     for i in range(rounds):
@@ -135,6 +136,7 @@ def follow_whole(body: MarkedBody, targets: np.ndarray, rate: float, config: Ani
         order = label_order(body.positions(x), targets, rate, config.outlier)
         taken = np.take_along_axis(targets, order[..., None], axis=1)[inside]
         near = reinitialise_frames(body, x[inside].copy(), taken, config)         # a copy: x changes below
+        near = hinges.turn_back(near, taken, config)
         weights, _ = marker_weights(body.positions(near), taken, config.marker_sd, config.outlier)
 
         # one step of all frames together
