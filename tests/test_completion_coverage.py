@@ -7,7 +7,7 @@ import pytest
 
 from completion.mocap.files.markers import MarkerSequence, read_markers
 from completion.mocap.files.motion_files import write_motion_folder
-from completion.mocap.joint_angles import anatomical_angles
+from completion.mocap.joint_angles import Known, anatomical_angles
 from completion.mocap.marker_sets.layout import MarkerLayout
 from completion.mocap.marker_sets.named import load_layout
 from completion.mocap.pose.coverage import between, find_coverage, find_told_parts, marker_labels, untold_spans
@@ -108,14 +108,14 @@ def test_gaps_are_bridged_for_a_moment():
     assert not untold_spans(subject().skeleton, told[5:30], 50.0)
     # angles are empty there, and only there
     centres = subject().joints(motion.poses, motion.trans)
-    angles = anatomical_angles(motion, subject(), centres, told)
+    angles = anatomical_angles(motion, subject(), centres, Known(told))
     degrees = dict(zip(angles.names, angles.degrees.T, strict=True))
     assert np.isnan(degrees["knee_angle_l"]).sum() == 16 and np.isfinite(degrees["knee_angle_r"]).all()
 
 
 def test_angles_that_are_guesses_are_in_no_table(tmp_path):
     found, motion = covered(LEGS)
-    write_motion_folder(tmp_path, motion, subject(), None, find_told_parts(subject(), LAYOUT, motion))
+    write_motion_folder(tmp_path, motion, subject(), None, Known(find_told_parts(subject(), LAYOUT, motion)))
     lines = (tmp_path / "motion.mot").read_text().splitlines()
     head = lines[lines.index("endheader") + 1].split("\t")
     assert "knee_angle_r" in head and "hip_flexion_l" in head and head[1:7] == [

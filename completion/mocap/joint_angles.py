@@ -126,6 +126,18 @@ class JointAngles:
         return tuple(reason for _, reason in sorted(found, reverse=True)[:3])
 
 
+@dataclass(frozen=True, eq=False)
+class Known:
+    """What is known of the angles of a motion of T frames besides the motion itself."""
+
+    told: np.ndarray | None = None           # (T, J) bool: parts that the markers determine
+    errors: np.ndarray | None = None         # (T, K) degrees, of `expect_angle_errors`
+    zero: Mapping[str, np.ndarray] | None = None         # of `find_static_zero`
+
+
+NOTHING_KNOWN = Known()
+
+
 def anatomy(names: tuple[str, ...], parents: np.ndarray, joints: np.ndarray) -> SegmentAxes:
     """Find the segments of a person with joints (J, 3), metres, at rest.
 
@@ -187,12 +199,10 @@ def _long_axes(long: np.ndarray, body: np.ndarray, by_front: bool) -> np.ndarray
     return np.stack([kept, y, np.cross(kept, y)] if by_front else [np.cross(y, kept), y, kept], axis=1)
 
 
-def anatomical_angles(motion: Motion, subject: Subject, centres: np.ndarray, told: np.ndarray | None = None,
-                      errors: np.ndarray | None = None) -> JointAngles:
+def anatomical_angles(motion: Motion, subject: Subject, centres: np.ndarray, known: Known = NOTHING_KNOWN) -> JointAngles:
     """Compute the joint angles of a person in motion, whose joints are at `centres` (T, J, 3), metres.
 
-    With `told` (T, J) bool, only angles between parts that the markers determine; others are NaN. `errors` are those of
-    `expect_angle_errors`, if known.
+    Angles between parts that the markers do not determine are NaN.
 
     Raises
     ------
@@ -203,26 +213,45 @@ def anatomical_angles(motion: Motion, subject: Subject, centres: np.ndarray, tol
     segments = anatomy(skeleton.names, skeleton.parents, rest_joints(subject))
     R = skeleton.part_rotations(motion.poses)
     ground = ground_axes(segments.axes, R[:, segments.parts["pelvis"]])
-    degrees = angles_of(segments, ground, segments.move(R, centres))
+    degrees = angles_of(segments, ground, segments.move(R, centres), known.zero)
     pelvis = centres[:, list(segments.hips or (segments.parts["pelvis"],))].mean(axis=1) @ ground
     # an angle is determined in the frames that tell of both its segments
     joints = segments.joints()
     names = [name for joint in joints for name in joint.angles]
     for k, joint in enumerate(joints):
         ends = [segments.parts[one] for one in (joint.proximal, joint.distal) if one != "ground"]
-        if told is not None:
-            degrees[~told[:, ends].all(axis=1), 3 * k:3 * k + 3] = np.nan
-    known = np.isfinite(degrees).any(axis=0)
-    determined, guessed = (tuple(np.array(names)[some].tolist()) for some in (known, ~known))
-    if errors is not None:
-        errors = np.where(np.isfinite(degrees), errors, np.nan)[:, known]
-    return JointAngles(determined, degrees[:, known], pelvis, ground, segments.missing(), guessed, errors)
+        if known.told is not None:
+            degrees[~known.told[:, ends].all(axis=1), 3 * k:3 * k + 3] = np.nan
+    some = np.isfinite(degrees).any(axis=0)
+    determined, guessed = (tuple(np.array(names)[which].tolist()) for which in (some, ~some))
+    errors = None if known.errors is None else np.where(np.isfinite(degrees), known.errors, np.nan)[:, some]
+    return JointAngles(determined, degrees[:, some], pelvis, ground, segments.missing(), guessed, errors)
+
+
+def find_static_zero(motion: Motion, subject: Subject) -> dict[str, np.ndarray]:
+    """Find the zero of joint angles from a static trial: somebody who stands upright and still.
+
+    Returns
+    -------
+    {str: (3, 3) float}
+        By the first angle of each joint, how its segments are turned against each other on average.
+    """
+    skeleton = subject.skeleton
+    segments = anatomy(skeleton.names, skeleton.parents, rest_joints(subject))
+    axes = segments.move(skeleton.part_rotations(motion.poses), subject.joints(motion.poses, motion.trans))
+    zero = {}
+    for joint in segments.joints():
+        if joint.proximal != "ground":
+            mean = (axes[joint.proximal].swapaxes(1, 2) @ axes[joint.distal]).mean(axis=0)
+            u, _, v = np.linalg.svd(mean)
+            zero[joint.angles[0]] = u @ np.diag([1, 1, np.linalg.det(u @ v)]) @ v
+    return zero
 
 
 def angle_doubts(motion: Motion, subject: Subject, told: np.ndarray) -> tuple[str, ...]:
     """Return the doubts of the joint angles that `told` (T, J) bool determines; none of a body that is no person's."""
     try:
-        return anatomical_angles(motion, subject, subject.joints(motion.poses, motion.trans), told).doubts()
+        return anatomical_angles(motion, subject, subject.joints(motion.poses, motion.trans), Known(told)).doubts()
     except ValueError:
         return ()
 
@@ -232,12 +261,18 @@ def rest_joints(subject: Subject) -> np.ndarray:
     return subject.joints(np.zeros((len(subject.skeleton.parents), 3)))
 
 
-def angles_of(found: SegmentAxes, ground: np.ndarray, axes: Mapping[str, np.ndarray]) -> np.ndarray:
-    """Compute joint angles (T, K), degrees, from the axes (T, 3, 3) of each segment, three for each joint in order."""
+def angles_of(found: SegmentAxes, ground: np.ndarray, axes: Mapping[str, np.ndarray],
+              zero: Mapping[str, np.ndarray] | None = None) -> np.ndarray:
+    """Compute joint angles (T, K), degrees, from the axes (T, 3, 3) of each segment, three for each joint in order.
+
+    They are 0 where the joints are as in `zero`, of `find_static_zero`; without it where the axes agree.
+    """
     columns = []
     for joint in found.joints():
         proximal = ground[None] if joint.proximal == "ground" else axes[joint.proximal]
         relative = proximal.swapaxes(1, 2) @ axes[joint.distal]
+        if zero is not None and joint.angles[0] in zero:
+            relative = relative @ zero[joint.angles[0]].T
         if joint.mirrored:
             relative = _MIRROR @ relative @ _MIRROR
         turns = np.array(joint.signs) * decompose(relative, joint.sequence, joint.distal.startswith("humerus"))

@@ -32,7 +32,7 @@ from ..angle_errors import expect_angle_errors
 from ..files.markers import MarkerSequence, read_markers
 from ..files.motion_files import write_glb, write_motion_folder
 from ..files.opensim import remove_distrusted
-from ..joint_angles import angle_doubts
+from ..joint_angles import Known, angle_doubts
 from ..labelling.labelled_file import label_first, show_labels
 from ..marker_sets.layout import MarkerLayout
 from ..marker_sets.named import choose_layout
@@ -128,8 +128,8 @@ class AnimateTask:
             judgement = judge_motions(person_judgement(self.model, fit.betas), judgement, [motion], body.template)
         metrics = [judgement_row(judgement), *metrics, *covered.metrics(),
                    *untold_spans(body.skeleton, told, motion.rate), *motion_figures(motion)]
-        write_motion_folder(output, motion, body, remove_distrusted(motion, sequence), told,
-                            expect_angle_errors(motion, body, layout, sequence))
+        write_motion_folder(output, motion, body, remove_distrusted(motion, sequence),
+                            Known(told, expect_angle_errors(motion, body, layout, sequence)))
         metrics += write_glb(output / "animation.glb", motion, body)
         page = motion_page(motion, body, sequence, path.name, metrics)
         if self.unlabelled:

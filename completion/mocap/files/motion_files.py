@@ -19,6 +19,7 @@ from scanprep.geometry.farthest_points import spread_indices
 from scanprep.pictures.camera import guess_upright
 
 from ...motion import Motion
+from ..joint_angles import NOTHING_KNOWN, Known
 from .markers import MarkerSequence
 from .opensim import mask_unknown_centres, write_opensim
 
@@ -87,15 +88,15 @@ def joint_centres(motion: Motion, subject: Subject) -> np.ndarray:
 
 
 def write_motion_folder(folder: Path, motion: Motion, subject: Subject, markers: MarkerSequence | None = None,
-                        told: np.ndarray | None = None, errors: np.ndarray | None = None) -> None:
+                        known: Known = NOTHING_KNOWN) -> None:
     """Write motion.npz, .bvh, .trc and .mot, tables of joint angles and centres, and residuals.csv if there are any.
 
-    `markers`, of as many frames, go into the TRC. Values between parts that the markers do not determine (`told` (T,
-    J) bool) are empty cells in tables. `errors` are those of the joint angles, from `expect_angle_errors`.
+    `markers`, of as many frames, go into the TRC. What is `known` of the joint angles: values between parts that the
+    markers do not determine are empty cells.
     """
     skeleton, T, centres = subject.skeleton, len(motion.poses), joint_centres(motion, subject)
     names, angles = skeleton.names, joint_angles(motion)
-    if told is not None:
+    if (told := known.told) is not None:
         angles[~(told & told[:, np.maximum(skeleton.parents, 0)])] = np.nan     # unknown if either side is
     motion.save(folder / "motion.npz")
     write_motion_bvh(folder / "motion.bvh", motion, subject)
@@ -103,7 +104,7 @@ def write_motion_folder(folder: Path, motion: Motion, subject: Subject, markers:
                   np.c_[motion.times, angles.reshape(T, -1)])
     write_numbers(folder / "joint_centres.csv", ["time", *(f"{name}_{axis}" for name in names for axis in "xyz")],
                   np.c_[motion.times, mask_unknown_centres(centres, skeleton, told).reshape(T, -1)])
-    write_opensim(folder, motion, subject, centres, markers, told, errors)
+    write_opensim(folder, motion, subject, centres, markers, known)
     if motion.labels:
         write_residuals(folder / "residuals.csv", motion)
 

@@ -19,20 +19,19 @@ from scanprep.skeleton.roles import find_numbered_roles
 from scanprep.skeleton.tree import Skeleton
 
 from ...motion import Motion
-from ..joint_angles import JointAngles, anatomical_angles, ground_axes
+from ..joint_angles import NOTHING_KNOWN, JointAngles, Known, anatomical_angles, ground_axes
 from .markers import MarkerSequence, write_markers
 
 
 def write_opensim(folder: Path, motion: Motion, subject: Subject, centres: np.ndarray,
-                  markers: MarkerSequence | None = None, told: np.ndarray | None = None,
-                  errors: np.ndarray | None = None) -> None:
+                  markers: MarkerSequence | None = None, known: Known = NOTHING_KNOWN) -> None:
     """Write motion.trc with markers, if any, and joint centres (T, J, 3), metres; joint angles for a person's body.
 
-    Centres and angles between parts that the markers do not determine (`told` (T, J) bool) are empty cells.
+    Centres and angles between parts that the markers do not determine are empty cells, as far as that is `known`.
     """
-    points = centre_sequence(mask_unknown_centres(centres, subject.skeleton, told), subject.skeleton, motion.rate)
+    points = centre_sequence(mask_unknown_centres(centres, subject.skeleton, known.told), subject.skeleton, motion.rate)
     try:
-        angles = anatomical_angles(motion, subject, centres, told, errors)
+        angles = anatomical_angles(motion, subject, centres, known)
     except ValueError as error:
         say(f"motion.mot is not written: {error}")
         # without a person's parts the ground follows from how the body stands

@@ -41,6 +41,7 @@ class MoshCall(KeptCall):
     unit: str | None = None
     rate: float | None = None
     unlabelled: bool = False
+    static: Path | None = None
     config: MoshConfig = field(default_factory=MoshConfig)
 
     def actors(self, output: Path) -> list[Actor]:

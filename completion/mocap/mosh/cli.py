@@ -33,7 +33,7 @@ Models = Annotated[tuple[Path, ...], Alias("-m", each=True)]
 def mosh_markers(markers: MarkersArg, output: Output, model: Models = (), layout: str | None = None,
                  subject_prefix: Annotated[str, Called("--subjects")] = "auto", hold_out: tuple[str, ...] = (),
                  retarget_to: Annotated[Path | None, Called("--character")] = None, unit: PersonUnit | None = None,
-                 rate: Positive | None = None, unlabelled: bool = False,
+                 rate: Positive | None = None, unlabelled: bool = False, static: Path | None = None,
                  config: MoshConfig = MoshConfig(),
                  workers: Workers = Workers(), *, space: Workspace) -> Outcome:
     """Body shape, marker places, motion and soft tissue of people from markers alone.
@@ -46,7 +46,8 @@ def mosh_markers(markers: MarkersArg, output: Output, model: Models = (), layout
 
     Begin with report.html in the output. Each person has a folder with subject.json (betas), layout.json (where the
     markers sat), report.html, and in it a folder for each sequence: motion.npz and soft_tissue.npz, animation.glb,
-    motion.bvh, joint_angles.csv, joint_centres.csv, residuals.csv and residuals_soft.csv (metres), for OpenSim
+    motion.bvh, anatomical_angles.csv (ISB joint angles, degrees, and their expected errors), joint_angles.csv (of the
+    skeleton), joint_centres.csv, residuals.csv and residuals_soft.csv (metres), for OpenSim
     motion.trc and motion.mot (ISB joint angles), virtual.c3d (labels put right, gaps filled by the body, joint
     centres), artefacts.json and artefacts.csv, report.html.
 
@@ -74,6 +75,7 @@ def mosh_markers(markers: MarkersArg, output: Output, model: Models = (), layout
         rate: Frames a second, where a file does not say or says it wrongly.
         unlabelled: The markers have no names: they are labelled first, as by `scape label`; --layout says which are
             worn.
+        static: Recording of the same person who stands upright and still, in which the joint angles are then 0.
         config: Settings.
         workers: Who does the work, a person at a time.
     """
@@ -83,7 +85,7 @@ def mosh_markers(markers: MarkersArg, output: Output, model: Models = (), layout
     if unlabelled and layout is None:
         raise UsageError("--unlabelled: expected --layout: which markers are worn, of scape layout list")
     units = resolve_marker_unit(markers, unit)
-    call = MoshCall(markers, model, layout, subject_prefix, held, retarget_to, units, rate, unlabelled, config)
+    call = MoshCall(markers, model, layout, subject_prefix, held, retarget_to, units, rate, unlabelled, static, config)
     with bar("people") as people, bar("one of them") as inside:
         return carry_out(call, space, workers, f"scape mosh {' '.join(sys.argv[2:])}", people, inside)
 
@@ -93,7 +95,7 @@ def carry_out(call: MoshCall, space: Workspace, workers: Workers, command: str, 
     actors, loaded = call.actors(space.folder), call.models()
     work = MoshTask(loaded.neutral, loaded.name, loaded.sexes, loaded.character,
                     None if call.layout is None else choose_layout(loaded.neutral, call.layout, ()), call.hold_out,
-                    call.unit, call.rate, call.unlabelled, call.config, command)
+                    call.unit, call.rate, call.unlabelled, call.static, call.config, command)
     # write the grouping to subjects.csv; one that the user edited stays, and has to be named with --subjects
     table = space.folder / TABLE
     if not table.exists() or space.is_ours(TABLE):

@@ -12,6 +12,7 @@ import numpy as np
 
 from model.body import BodyModel
 from model.learning.sexes import SexGuess
+from model.linear import Subject
 from model.people import person_judgement
 from scanprep.arguments import UsageError
 from scanprep.batch.room import TaskContext
@@ -30,11 +31,12 @@ from ..artefacts.results import artefact_table, write_virtual
 from ..files.markers import MarkerSequence, read_markers
 from ..files.motion_files import joint_centres, write_glb, write_motion_folder, write_residuals
 from ..files.opensim import centre_sequence, mask_unknown_centres
-from ..joint_angles import angle_doubts
+from ..joint_angles import Known, anatomical_angles, angle_doubts, find_static_zero
 from ..labelling.labelled_file import label_first, show_labels
 from ..marker_sets.layout import MarkerLayout
 from ..marker_sets.named import choose_layout
 from ..pose.coverage import Coverage, find_coverage, find_told_parts, untold_spans
+from ..pose.follow import animate
 from ..pose.judgement import judge_motions, markers_told, motion_doubts, motion_problem
 from ..retargeting.retarget import retarget
 from ..retargeting.soft_tissue import picture_transfer, retarget_soft_tissue, write_character
@@ -48,6 +50,8 @@ from .takes import LightMesh, Take, measure_held_out
 ERRORS = ("held-out error, fixed shape", "held-out error, soft tissue", "markers to the body, fixed shape",
           "left over after soft tissue was fitted")
 FIXED = ERRORS[2]                    # the one that every person has
+# metres: markers of a person are 5 to 15 mm off in another recording of the same session; and degrees from upright
+SOMEBODY_ELSE, STANDING = 0.025, {"hip_flexion": 35, "hip_adduction": 25, "knee_angle": 30, "ankle_angle": 35}
 HALF = 100                           # steps of progress for shape and motion, and as many for files and pictures
 
 
@@ -64,6 +68,7 @@ class MoshTask:
     unit: str | None
     rate: float | None                   # frames a second, where a file does not say
     unlabelled: bool                     # markers have no names
+    static: Path | None                  # static trial, in which joint angles are 0
     config: MoshConfig
     command: str = field(metadata={"digest": False})
 
@@ -127,7 +132,8 @@ class _Found:
     takes: list[Take]
     usual: MarkerLayout
     layout_name: str
-    labelling: Judgement                 # of labels that were found for unlabelled recordings
+    labelling: Judgement                 # of labels that were found for unlabelled recordings, and of a static trial
+    zero: Mapping[str, np.ndarray] | None        # of joint angles, from a static trial
 
     @cached_property
     def person(self) -> Judgement:
@@ -209,7 +215,27 @@ def _solve(work: MoshTask, actor: Actor, context: TaskContext) -> tuple[_Found, 
         held = measure_held_out(model, usual, work.hold_out, markers, result.motions[i], soft)
         takes.append(Take(source, unit, model, subject, markers, result.motions[i], soft, result.artefacts[i],
                           held, light))
-    return _Found(model, guess, result, takes, usual, layout_name, Judgement().merge(*labelling)), failures
+    zero, doubts = _stand(work, subject, result.layout) if work.static else (None, Judgement())
+    return _Found(model, guess, result, takes, usual, layout_name, Judgement().merge(*labelling, doubts),
+                  zero), failures
+
+
+def _stand(work: MoshTask, subject: Subject, layout: MarkerLayout) -> tuple[dict[str, np.ndarray], Judgement]:
+    """Find the zero of joint angles in the static trial of a person; judge whether it is one, and of that person."""
+    assert work.static is not None, "the command asks for one"
+    markers = read_markers(work.static, work.unit, None, work.rate)
+    motion = animate(subject, markers, layout, work.config.poses)
+    doubts = []
+    off = float(np.nanmedian(motion.residuals)) if np.isfinite(motion.residuals).any() else np.inf
+    if off > SOMEBODY_ELSE:
+        doubts.append(f"the static trial {work.static.name} has its markers {MM * off:.0f} mm off this person: is it "
+                      "of somebody else, or of another session?")
+    still = anatomical_angles(motion, subject, subject.joints(motion.poses, motion.trans))
+    for name, degrees in zip(still.names, still.degrees.T, strict=True):
+        if name[:-2] in STANDING and abs(float(np.median(degrees))) > STANDING[name[:-2]]:
+            doubts.append(f"{name} is {np.median(degrees):.0f} degrees in the static trial {work.static.name}, which "
+                          "counts as 0: expected somebody who stands upright")
+    return find_static_zero(motion, subject), Judgement.of(check=doubts[:3])
 
 
 def _write(work: MoshTask, found: _Found, take: Take, context: TaskContext, settings: Mapping[str, Any]
@@ -240,8 +266,9 @@ def _write(work: MoshTask, found: _Found, take: Take, context: TaskContext, sett
     determined = found.told(take)
     metrics += untold_spans(take.subject.skeleton, determined, take.motion.rate)
     metrics += context.files(f"{take.name} files",
-                             (solved, determined, take.source.path, take.source.who, take.unit, factor),
-                             lambda folder: write_take(place(folder), take, found.result.layout, determined, factor))
+                             (solved, determined, take.source.path, take.source.who, take.unit, factor, found.zero),
+                             lambda folder: write_take(place(folder), take, found.result.layout, determined, factor,
+                                                       found.zero))
     shown: list[Any] = []
     if (body := work.character) is not None:
         *shown, exact = context.files(f"{take.name} character", (solved, body, factor),
@@ -252,16 +279,17 @@ def _write(work: MoshTask, found: _Found, take: Take, context: TaskContext, sett
     return metrics, clocks() - start
 
 
-def write_take(folder: Path, take: Take, layout: MarkerLayout, told: np.ndarray | None = None, factor: float = 1.0
-               ) -> list[Metric]:
+def write_take(folder: Path, take: Take, layout: MarkerLayout, told: np.ndarray | None = None, factor: float = 1.0,
+               zero: Mapping[str, np.ndarray] | None = None) -> list[Metric]:
     """Write all files of a sequence but its page; exaggerated.glb only for a factor on soft tissue other than 1.
 
     Angles and joint centres between parts that the markers do not determine (`told` (T, J) bool) are empty cells.
+    `zero` is that of the angles in a static trial.
     Returned is the distance of the GLB files from the exact bodies.
     """
     motion, body, soft = take.motion, take.subject, take.soft
-    write_motion_folder(folder, motion, body, take.artefacts.virtual(), told,
-                        expect_angle_errors(motion, body, layout, take.markers))
+    errors = expect_angle_errors(motion, body, layout, take.markers, zero is not None)
+    write_motion_folder(folder, motion, body, take.artefacts.virtual(), Known(told, errors, zero))
     exact = write_glb(folder / "animation.glb", take.shown, body, None if soft is None else take.make)
     if soft is not None:
         soft.save(folder / "soft_tissue.npz")
