@@ -199,7 +199,8 @@ def _long_axes(long: np.ndarray, body: np.ndarray, by_front: bool) -> np.ndarray
     return np.stack([kept, y, np.cross(kept, y)] if by_front else [np.cross(y, kept), y, kept], axis=1)
 
 
-def anatomical_angles(motion: Motion, subject: Subject, centres: np.ndarray, known: Known = NOTHING_KNOWN) -> JointAngles:
+def anatomical_angles(motion: Motion, subject: Subject, centres: np.ndarray, known: Known = NOTHING_KNOWN
+                      ) -> JointAngles:
     """Compute the joint angles of a person in motion, whose joints are at `centres` (T, J, 3), metres.
 
     Angles between parts that the markers do not determine are NaN.
