@@ -56,13 +56,13 @@ def test_the_roll_of_the_bones_at_rest_does_not_matter(tmp_path, kind, down, rol
     path = export_rolled(tmp_path / "a.bvh", poses, trans, kind, down, rolls)
     found, mean = read_motion(path, model), model.subject(np.zeros(1))
     off = twist_errors(poses, found.poses, model.skeleton)
-    assert max(off.values()) < 6, "the plane of a bend is some degrees off the axis of the model's own hinge"
+    assert max(off.values()) < 8, "the plane of a bend is some degrees off the axis of the model's own hinge"
     assert apart(mean.vertices(found.poses, found.trans), mean.vertices(poses)) < 5
     assert not found.twist.reasons
     for part, angle in zip(found.twist.parts, found.twist.rolled, strict=True):
         side, _, name = part.partition(" ")
         known = rolls.get(name.replace(" ", "_"), 0) * (1 if side == "left" else -1)
-        assert abs((angle - known + 180) % 360 - 180) < 6 and (angle == 0) == (known == 0)
+        assert abs((angle - known + 180) % 360 - 180) < 8 and (angle == 0) == (known == 0)
 
 
 @pytest.mark.parametrize(("kind", "down"), [("cmu", 0), ("mixamo", 45), ("makehuman", None), ("cmu", 88)])
@@ -94,8 +94,8 @@ def test_arms_that_never_bend_are_judged_by_what_a_shoulder_can(tmp_path):
     found = read_motion(path, small_people())
     assert found.twist.twists[:, found.twist.parts.index("left upper arm")] == pytest.approx(144, abs=1)
     for side in ("left", "right"):
-        assert (f"in 10 of 10 frames the {side} upper arm is twisted by 144 degrees about its axis, more than a person's"
-                ) in found.twist.reasons
+        assert (f"in 10 of 10 frames the {side} upper arm is twisted by 144 degrees about its axis, more than a "
+                "person's") in found.twist.reasons
     assert all("upper arm" in reason for reason in found.twist.reasons)
 
 
@@ -125,6 +125,10 @@ def test_the_verdict_of_a_copied_motion_tells_a_twisted_arm(tmp_path):
             "metrics"]}
     assert verdicts["own"]["judgement"].startswith("check: in ")
     assert "beside its axis than a person's: is the left upper arm twisted?" in verdicts["own"]["judgement"]
+    assert main(["model", "export", str(tmp_path / "model.npz"), "--motion", str(tmp_path / "own.bvh"), "-o",
+                 str(tmp_path / "again.bvh")]) == 0
+    exported = json.loads((tmp_path / "again.bvh.report.json").read_text())["judgement"]
+    assert exported["verdict"] == "check" and "is the left upper arm twisted?" in exported["reasons"][0]
     assert verdicts["rolled"]["judgement"] == "good"
     assert "left upper arm -14" in verdicts["rolled"]["bones rolled otherwise at rest, allowed for"]
 
@@ -135,7 +139,7 @@ def test_a_roll_is_found_from_bent_frames_only_and_carried_between_them():
     constant, changing = find_roll(within, bend, allowed)
     assert constant == 0 and not changing.any(), "what the hinge allows is no error; straight frames do not count"
     constant, changing = find_roll(np.array([0, 2.9, 0, 0, -2.9, 0.0]), bend, allowed)
-    assert abs(constant) == pytest.approx(np.pi) and not changing.any(), "the mean of angles on both sides of a half turn"
+    assert abs(constant) == pytest.approx(np.pi) and not changing.any(), "a half turn from both sides"
     constant, changing = find_roll(np.array([0, 0.9, 0, 0, -0.9, 0.0]), bend, allowed)
     assert constant == pytest.approx(0, abs=1e-9)
     assert changing == pytest.approx([0.9, 0.9, 0.3, -0.3, -0.9, -0.9])
@@ -162,7 +166,7 @@ def test_the_angle_of_a_hinge_undoes_a_twist():
     turned = R[:, hinge.parts[0]] @ rotations.exp(0.7 * bone)
     assert hinge.angles(turned, 0) - hinge.angles(R[:, hinge.parts[0]], 0) == pytest.approx(-0.7)
     bends = replace(hinge, bend=np.radians([20.0, 90.0]))
-    assert np.degrees(bends.allowed(0)) == pytest.approx([12 + 37.4, 24], abs=0.1)
+    assert np.degrees(bends.tolerance(0)) == pytest.approx([12 + 37.4, 24], abs=0.1)
 
 
 def test_the_twist_of_a_rotation_leaves_its_swing_out():

@@ -126,7 +126,7 @@ def measure_twist(skeleton: Skeleton, poses: np.ndarray, centres: np.ndarray, ro
             names.append((in_words(f"{SIDED_ROLES[role[2:]].part}_{hinge.side}"), f"{hinge.side} {hinge.joint}"))
             twists.append(axial(np.swapaxes(R[:, top], -1, -2) @ R[:, part], hinge.bones[k]))
             limits.append(hinge.limits[k])
-            over = np.maximum(np.abs(hinge.angles(R[:, part], k)) - hinge.allowed(k), 0)
+            over = np.maximum(np.abs(hinge.angles(R[:, part], k)) - hinge.tolerance(k), 0)
             beside.append(np.where(hinge.bend > BENT, over, 0))
             changed.append(rolls.get(part, none).changing)
             rolled.append(np.degrees(rolls.get(part, none).constant))

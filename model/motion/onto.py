@@ -36,7 +36,7 @@ class BodyMotion:
     rest: str = ""                   # what is uncertain about the rest pose of its own skeleton
     brought: Retargeted | None = None    # result of retargeting, for a motion of another skeleton
     fit: RetargetingError | None = None
-    twist: TwistError | None = None      # of a motion of another skeleton or of another file
+    twist: TwistError | None = None      # of a motion that was retargeted or copied
 
     def at_rate(self, rate: float) -> BodyMotion:
         """Resample the motion to a frame rate: rotations by the shortest way between frames, places linearly."""
@@ -58,8 +58,12 @@ class BodyMotion:
             return []
         off = self.fit and f", joint centres {MM * self.fit.distance:.0f} mm, segments {self.fit.angle:.1f}° off"
         return [Metric("motion copied", f"{self.how}{off or ''}"),
-                *([Metric("rest of its skeleton", self.rest)] if self.rest else []),
-                *(Metric("twist", reason) for reason in (self.twist.reasons if self.twist else ()))]
+                *([Metric("rest of its skeleton", self.rest)] if self.rest else [])]
+
+    @property
+    def doubts(self) -> list[str]:
+        """Why the twists of a retargeted motion need a look."""
+        return self.twist.reasons if self.twist else []
 
 
 def read_motion(path: str | Path, model: BodyModel, subject: Subject | None = None, unit: str | None = None,

@@ -42,7 +42,7 @@ class Hinge:
         h = np.einsum("tba,tb->ta", R, self.normal)
         return np.asarray(np.arctan2(np.cross(self.axes[k], h) @ self.bones[k], h @ self.axes[k]))
 
-    def allowed(self, k: int) -> np.ndarray:
+    def tolerance(self, k: int) -> np.ndarray:
         """Compute how far (T,), radians, the bend may be from the axis of part k: far where it is hardly bent."""
         return np.radians(self.slack[k]) + np.arcsin(np.minimum(np.sin(CARRY) / np.sin(np.maximum(self.bend, BENT)), 1))
 
@@ -81,10 +81,10 @@ class Roll:
     bone: np.ndarray                 # (3,) direction at rest
 
 
-def find_roll(angle: np.ndarray, bend: np.ndarray, allowed: np.ndarray) -> tuple[float, np.ndarray]:
+def find_roll(angle: np.ndarray, bend: np.ndarray, tolerance: np.ndarray) -> tuple[float, np.ndarray]:
     """Find the roll of a part, constant and changing (T,), from the angles (T,) that its hinge asks for, radians.
 
-    What is within `allowed` (T,) is no error. The mean over the bent frames is one roll at rest. If more remains in
+    What is within `tolerance` (T,) is no error. The mean over the bent frames is one roll at rest. If more remains in
     many frames, the hinge is followed. Between bent frames this is interpolated: the motion's own relative roll carries
     on.
 
@@ -99,12 +99,12 @@ def find_roll(angle: np.ndarray, bend: np.ndarray, allowed: np.ndarray) -> tuple
         return 0.0, np.zeros(len(angle))
     weight = np.sin(bend[bent])
     constant = _mean_angle(angle[bent], weight)
-    if abs(constant) <= np.average(allowed[bent], weights=weight):
+    if abs(constant) <= np.average(tolerance[bent], weights=weight):
         constant = 0.0
     # what remains, without jumps of whole turns
     off = np.unwrap(wrap_angle(angle[bent] - constant))
     off -= 2 * np.pi * np.rint(off.mean() / (2 * np.pi))
-    if (np.abs(off) > allowed[bent]).mean() < OFTEN:                    # single frames: noise, or a knee bent backwards
+    if (np.abs(off) > tolerance[bent]).mean() < OFTEN:                    # a few: noise, or a knee bent backwards
         return constant, np.zeros(len(angle))
     return constant, np.interp(np.arange(len(angle)), bent, off)
 
@@ -138,7 +138,7 @@ def roll_limbs(hinges: Sequence[Hinge], parents: np.ndarray, world: Mapping[int,
         for k, part in enumerate(hinge.parts[:2]):
             angle = hinge.angles(world[part], k)
             shared = _nearer(roll, angle[bent])
-            constant, changing = find_roll(wrap_angle(angle - shared), hinge.bend, hinge.allowed(k))
+            constant, changing = find_roll(wrap_angle(angle - shared), hinge.bend, hinge.tolerance(k))
             roll = float(wrap_angle(shared + constant)) if bent.any() else -known.get((hinge.joint, k), 0.0)
             known[hinge.joint, k] = roll
             turns[part] = rotations.exp(roll * hinge.bones[k])

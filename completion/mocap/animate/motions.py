@@ -1,6 +1,7 @@
 """Motions of another skeleton (BVH, AMASS), or keys, on a body, with figures and page."""
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -8,7 +9,7 @@ import numpy as np
 
 from model.body import BodyModel
 from model.linear import Subject
-from model.motion.error import LEAN, MOST, RetargetingError, TwistError
+from model.motion.error import LEAN, MOST, RetargetingError
 from model.motion.files import is_motion as holds_poses
 from model.motion.onto import BodyMotion, read_motion
 from scanprep.batch.room import TaskContext
@@ -54,7 +55,7 @@ def bring(path: Path, model: BodyModel, name: str, subject: Subject | None, unit
     else:
         source = read_motion(path, model, subject, unit, rate)
         body = subject if subject is not None else model.subject(source.betas)
-        judgement = judge_fit(source.fit, source.twist)
+        judgement = judge_fit(source.fit, source.doubts)
     motion = Motion.of(source)
     metrics = [judgement_row(judgement), Metric("model", name), *transfer_figures(source)]
     write_motion_folder(context.folder, motion, body)
@@ -71,9 +72,9 @@ def bring(path: Path, model: BodyModel, name: str, subject: Subject | None, unit
     return metrics, motion, body, page.section("Figures").figures(metrics)
 
 
-def judge_fit(fit: RetargetingError | None, twist: TwistError | None = None) -> Judgement:
-    """Judge a retargeted motion by the directions and twists of its segments and the lean of its skeleton."""
-    reasons = [] if twist is None else twist.reasons
+def judge_fit(fit: RetargetingError | None, twists: Sequence[str]) -> Judgement:
+    """Judge a retargeted motion by its segments, doubts about their twists, and the lean of its skeleton."""
+    reasons = [*twists]
     if fit is not None and fit.angle > MOST:
         worst = int(fit.angles.mean(axis=0).argmax())
         reasons.append(f"segments point {fit.angle:.0f} degrees off on average, that to the {_words(fit.names[worst])} "
