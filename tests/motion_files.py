@@ -97,3 +97,49 @@ def of_amass(poses, up=2):
     if up == 1:
         R = Y_UP @ R
     return Skeleton(np.arange(22), amass.PARENTS, rest, amass.NAMES).pose_of(R)
+
+
+SOURCES = {
+    "cmu": {part: name for part, name in OTHERS.items()},
+    "mixamo": {part: f"mixamorig:{name.replace('LowerBack', 'Spine')}" for part, name in OTHERS.items()},
+    "makehuman": {"pelvis": "root", "abdomen": "spine05", "chest": "spine01", "head": "head",
+                  **{f"{ours}_{side}": f"{theirs}.{side[0].upper()}" for side in ("left", "right") for ours, theirs in
+                     (("upper_arm", "upperarm01"), ("forearm", "lowerarm01"), ("hand", "wrist"),
+                      ("thigh", "upperleg01"), ("shin", "lowerleg01"), ("foot", "foot"))}}}
+
+
+def limb_bones(skeleton):
+    """{part: (3,) direction of its bone at rest}; hands and feet go on as the part before."""
+    J, out = skeleton.joints, {}
+    for j, name in enumerate(skeleton.names):
+        if name.endswith(("_left", "_right")):
+            child = next((k for k, p in enumerate(skeleton.parents) if p == j), None)
+            bone = J[j] - J[skeleton.parents[j]] if child is None else J[child] - J[j]
+            out[name] = bone / np.linalg.norm(bone)
+    return out
+
+
+def export_rolled(path, poses, trans, kind="cmu", down=None, rolls=None):
+    """A motion of the mean person as another program writes it: other names, straight arms so many degrees `down` from
+    level at rest (ours if None), bones rolled at rest by `rolls` {part: degrees on the left, mirrored on the right}.
+    The motion in the world is the same for all of them.
+    """
+    ours = make_rig(small_people(), np.zeros(1)).skeleton
+    bones, A = limb_bones(ours), np.tile(np.eye(3), (16, 1, 1))
+    for side, sign in (("left", 1), ("right", -1)):
+        R = np.eye(3)
+        for part in ("upper_arm", "forearm", "hand") if down is not None else ():
+            j = ours.names.index(f"{part}_{side}")
+            bone, angle = R @ bones[ours.names[j]], np.radians(down)
+            axis = np.cross(bone, [sign * np.cos(angle), 0, -np.sin(angle)])
+            sine = np.linalg.norm(axis)
+            R = rotations.exp(np.arcsin(min(sine, 1)) * axis / max(sine, 1e-12)) @ R if part != "hand" else R
+            A[j] = R
+        for part, roll in (rolls or {}).items():
+            j = ours.names.index(f"{part}_{side}")
+            A[j] = A[j] @ rotations.exp(sign * np.radians(roll) * bones[ours.names[j]])
+    R = Y_UP @ ours.part_rotations(poses) @ np.swapaxes(A, -1, -2) @ Y_UP.T
+    rest = joint_places(ours, ours.pose_of(A))
+    tree = Skeleton(np.arange(16), ours.parents, rest @ Y_UP.T, tuple(SOURCES[kind][name] for name in ours.names))
+    write_bvh(path, tree, tree.pose_of(R), trans @ Y_UP.T, 24.0, "cm", 1)
+    return path

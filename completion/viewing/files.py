@@ -253,7 +253,9 @@ class Files:
         if path.suffix.lower() == ".bvh" or read_motion_file(path, rate=self.rate).of_family:
             model = self._model_of(path)
             transferred = read_motion(path, model, unit=self.unit, rate=self.rate)
-            return Motion.of(transferred), model, tuple(f"{path.name}: {m.name} {m.value}" for m in transferred.told)
+            return Motion.of(transferred), model, tuple(
+                f"{path.name}: {note}" for note in (*(f"{m.name} {m.value}" for m in transferred.told),
+                                                    *transferred.doubts))
         motion = Motion.load(path, self.rate)
         model = self._model_of(path, motion)
         parts = len(model.skeleton.parents)

@@ -97,8 +97,9 @@ def export(model: ModelArg, output: Output, betas: tuple[Beta, ...] = (), own_bo
         raise ValueError(f"{model}: it has no shape components; ask for --own-body")
     order = Order(output, model, loaded, person, moves, shapes, correctives, unit or "cm",
                   None if up is None else "xyz".index(up), root, names, ground, front)
+    judgement = Judgement.of(check=moves.doubts if moves is not None else ())
     return Outcome(output, writer.write(order),
-                   judgement=person_judgement(loaded, np.array(betas), ASKED) if betas else Judgement())
+                   judgement=judgement.merge(person_judgement(loaded, np.array(betas), ASKED)) if betas else judgement)
 
 
 @dataclass(frozen=True, eq=False)

@@ -16,7 +16,7 @@ from ..body import BodyModel
 from ..linear import Subject
 from .amass import BODY, UNCERTAIN, moving_body, with_joints
 from .bvh import read_bvh
-from .error import RetargetingError, measure_error
+from .error import RetargetingError, TwistError, measure_error, measure_twist
 from .files import betas_for, check_ours, read_motion_file
 from .moving import MovingSkeleton
 from .retarget import Pairing, Retargeted, retarget_pair
@@ -36,6 +36,7 @@ class BodyMotion:
     rest: str = ""                   # what is uncertain about the rest pose of its own skeleton
     brought: Retargeted | None = None    # result of retargeting, for a motion of another skeleton
     fit: RetargetingError | None = None
+    twist: TwistError | None = None      # of a motion that was retargeted or copied
 
     def at_rate(self, rate: float) -> BodyMotion:
         """Resample the motion to a frame rate: rotations by the shortest way between frames, places linearly."""
@@ -58,6 +59,11 @@ class BodyMotion:
         off = self.fit and f", joint centres {MM * self.fit.distance:.0f} mm, segments {self.fit.angle:.1f}° off"
         return [Metric("motion copied", f"{self.how}{off or ''}"),
                 *([Metric("rest of its skeleton", self.rest)] if self.rest else [])]
+
+    @property
+    def doubts(self) -> list[str]:
+        """Why the twists of a retargeted motion need a look."""
+        return self.twist.reasons if self.twist else []
 
 
 def read_motion(path: str | Path, model: BodyModel, subject: Subject | None = None, unit: str | None = None,
@@ -131,7 +137,8 @@ def _onto(path: Path, moving: MovingSkeleton, model: BodyModel, subject: Subject
     same = copy_motion(skeleton, subject.template, subject.vertices, moving)
     if same is not None:
         return BodyMotion(same.poses, same.trans, subject.betas, same.rate, gender,
-                          "part by part, of the same skeleton", brought=same)
+                          "part by part, of the same skeleton", brought=same,
+                          twist=measure_twist(skeleton, same.poses, subject.joints(same.poses, same.trans)))
     moving, frame = standing_rest(moving)
     if frame is not None:
         uncertain = f"that of frame {frame}, in which it stands: the file has none of a person who does"
@@ -140,9 +147,10 @@ def _onto(path: Path, moving: MovingSkeleton, model: BodyModel, subject: Subject
         done = retarget_pair(pair)
     except ValueError as problem:
         raise StorageError(f"{path}: {problem}") from None
-    fit = measure_error(pair, done.poses, subject.joints(done.poses, done.trans))
+    centres = subject.joints(done.poses, done.trans)
+    fit, twist = measure_error(pair, done.poses, centres), measure_twist(skeleton, done.poses, centres, done.rolls)
     return BodyMotion(done.poses, done.trans, subject.betas, done.rate, gender, "by the directions of the segments",
-                      uncertain, done, fit)
+                      uncertain, done, fit, twist)
 
 
 def standing_rest(moving: MovingSkeleton) -> tuple[MovingSkeleton, int | None]:

@@ -1,13 +1,13 @@
 """Retargeting: a motion of one skeleton on another with a different rest pose, bones and parts.
 
 Every part of ours with a counterpart takes the counterpart's rotation, after the rotation that aligns the two bones at
-rest. So the directions of the limbs, and the twists about them, are exactly those of the motion. A trunk of any number
-of joints is mapped to ours.
+rest. So the directions of the limbs are exactly those of the motion. Their twists are too, unless elbows and knees
+would then bend aside. A trunk of any number of joints is mapped to ours.
 """
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from itertools import pairwise
 
 import numpy as np
@@ -20,6 +20,7 @@ from scanprep.skeleton.tree import Skeleton
 from ..rig import check_motion, joint_places
 from .moving import MovingSkeleton
 from .trunks import group_trunk, heights, nearest_starts, spread_rotations
+from .twist import Roll, find_hinges, roll_limbs
 
 Vertices = Callable[[np.ndarray, np.ndarray], np.ndarray]   # poses (T, J, 3), trans (T, 3) -> (T, N, 3), metres
 
@@ -34,6 +35,7 @@ class Retargeted:
     matched: dict[str, str]          # {part of the body: joint that it follows}
     lacking: tuple[str, ...] = ()    # parts that the motion has no joint for; they follow their parent
     scale: float = 1.0               # of the travel: ratio of the lengths of the legs
+    rolls: Mapping[int, Roll] = field(default_factory=dict)      # of parts, by their hinges
 
 
 class Pairing:
@@ -75,7 +77,7 @@ class Pairing:
             if missing:
                 raise ValueError(f"{what}: expected joints named like {', '.join(missing)}, found only "
                                  f"{', '.join(names)}"[:400])
-        self.axes = _axes(self.joints, self.ours)
+        self.axes = body_axes(self.joints, self.ours)
         feet = [skeleton.joints[self.ours[r]] for r in ("l_ankle", "r_ankle", "l_hip", "r_hip") if r in self.ours]
         high = skeleton.joints[self.ours.get("skullbase", self.ours["l_shoulder"])] - np.mean(feet[:2], axis=0)
         self.up = _nearest_axis(high)
@@ -154,7 +156,7 @@ class Pairing:
 
         Up is the coordinate axis nearest to the trunk, since the joints of a standing person are not in one line.
         """
-        _, high, forwards = (self.axes if ours else _axes(self.moving.rest, self.theirs)).T
+        _, high, forwards = (self.axes if ours else body_axes(self.moving.rest, self.theirs)).T
         return _upright(forwards, _nearest_axis(high))
 
 
@@ -168,6 +170,11 @@ def retarget_pair(pair: Pairing, aligned: bool = False, girdle: float = 0.2, her
     moving, skeleton = pair.moving, pair.skeleton
     A = pair.alignment(aligned)
     role_of = {part: role for role, part in pair.ours.items()}
+    # elbows and knees tell how the bones of the other skeleton are rolled at rest
+    hinges = [] if aligned else find_hinges(pair.joints, pair.ours, pair.axes[:, 2], moving.places, pair.theirs)
+    turns, rolls = roll_limbs(hinges, skeleton.parents, {
+        part: moving.rotations[:, pair.theirs[role_of[part]]] @ A[part] for hinge in hinges for part in hinge.parts})
+    A |= {part: A[part] @ turn for part, turn in turns.items()}
     between, told = pair.trunk()
     M = np.empty((len(moving.places), len(skeleton.parents), 3, 3))     # from the body's own axes to the world
     lacking, matched = [], {}
@@ -185,6 +192,8 @@ def retarget_pair(pair: Pairing, aligned: bool = False, girdle: float = 0.2, her
         else:
             lacking.append(name)
             M[:, j] = M[:, skeleton.parents[j]] if j else np.eye(3)
+        if j in rolls and rolls[j].changing.any():
+            M[:, j] = M[:, j] @ rotations.exp(rolls[j].changing[:, None] * rolls[j].bone)
     # missing clavicles are raised by a share of the upper arms' angle above the horizontal
     left, high, _ = pair.axes.T
     for side, outwards in (("l", left), ("r", -left)):
@@ -207,7 +216,7 @@ def retarget_pair(pair: Pairing, aligned: bool = False, girdle: float = 0.2, her
         place = place - place[0] + skeleton.joints[ours].mean(axis=0)
     trans = place - joint_places(skeleton, poses)[:, ours].mean(axis=1)
     trans = trans + lift(pair.vertices, poses, trans, pair.up) * pair.up
-    return Retargeted(poses, trans, moving.rate, matched, tuple(lacking), scale)
+    return Retargeted(poses, trans, moving.rate, matched, tuple(lacking), scale, rolls)
 
 
 def lift(vertices: Vertices, poses: np.ndarray, trans: np.ndarray, up: np.ndarray) -> float:
@@ -227,7 +236,7 @@ def _leg(joints: np.ndarray, roles: Mapping[str, int], others: Mapping[str, int]
     return float(np.mean([np.linalg.norm(np.diff(joints[chain], axis=0), axis=1).sum() for chain in chains]))
 
 
-def _axes(joints: np.ndarray, roles: Mapping[str, int]) -> np.ndarray:
+def body_axes(joints: np.ndarray, roles: Mapping[str, int]) -> np.ndarray:
     """Compute the axes of a body at rest from its hips and shoulders: columns left, up and front (3, 3)."""
     hips, shoulders = ([joints[roles[f"{side}_{name}"]] for side in "lr"] for name in ("hip", "shoulder"))
     across = sum((a - b) / max(float(np.linalg.norm(a - b)), 1e-12) for a, b in (hips, shoulders))

@@ -56,7 +56,8 @@ def repose(model: ModelArg, body: BodyArg, poses: Annotated[Path, Called("--moti
         Metric("distance from the body in its own pose, mean", 1e3 * found.mean, "mm"),
         Metric("distance from the body in its own pose, largest", 1e3 * found.largest, "mm")],
                    judgement=Judgement.of(None if found.mean <= HAND * size(loaded.template) else
-        f"the body is {1e3 * found.mean:.0f} mm from the model's; registered otherwise, or the wrong unit (--unit)?"))
+        f"the body is {1e3 * found.mean:.0f} mm from the model's; registered otherwise, or the wrong unit (--unit)?",
+        moves.doubts))
 
 
 def character(mesh: MeshArg, model: Annotated[Path, Alias("-m")], output: Output, landmarks: Path | None = None,

@@ -299,6 +299,7 @@ def animate(statue: StatueArg, motion: MotionArg, output: Output, model: Path | 
     control, up = loaded.control, loaded.upright_axis
     fine = subdivide_uniform(control.mesh, control.chart, level)
     detailed = Reconstruction(control, loaded.map, fine)
+    doubts: list[str] = []
     if model is None:
         if registered is not None:
             raise UsageError("--registered: expected --model with it")
@@ -322,6 +323,7 @@ def animate(statue: StatueArg, motion: MotionArg, output: Output, model: Path | 
         write_animated_glb(output / "statue.glb", fine.faces, np.stack([detailed(body) for body in bodies[::step]]),
                            frame_rate / step, up=up)
         rows = [Metric("follows", str(model))]
+        doubts = moves.doubts
     shown = bodies[::max(1, len(bodies) // 24)]
     with bar("rendering") as progress:
         write_gif(output / "motion.gif", motion_pictures(loaded, detailed, shown, progress),
@@ -335,8 +337,9 @@ def animate(statue: StatueArg, motion: MotionArg, output: Output, model: Path | 
     # angles have 0.010, a walk with degrees read as radians 0.012
     inverted = [len(find_inverted(control, body, fine, detailed(body))) for body in shown]
     share = max(inverted) / len(fine.faces)
-    doubts = [f"{100 * share:.1f}% of the triangles are inverted in a frame: the pose is beyond what the skin can "
-              "follow"] if share > 0.008 else []
+    if share > 0.008:
+        doubts = [f"{100 * share:.1f}% of the triangles are inverted in a frame: the pose is beyond what the skin can "
+                  "follow", *doubts]
     return Outcome(output, [Metric("frames", len(bodies)), Metric("rate", frame_rate, "1/s"), *rows,
                             Metric("inverted triangles in a frame, most", max(inverted))],
                    {"level": level, "model": model or BODY}, judgement=Judgement.of(check=doubts))

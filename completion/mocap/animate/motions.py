@@ -1,6 +1,7 @@
 """Motions of another skeleton (BVH, AMASS), or keys, on a body, with figures and page."""
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -54,7 +55,7 @@ def bring(path: Path, model: BodyModel, name: str, subject: Subject | None, unit
     else:
         source = read_motion(path, model, subject, unit, rate)
         body = subject if subject is not None else model.subject(source.betas)
-        judgement = judge_fit(source.fit)
+        judgement = judge_fit(source.fit, source.doubts)
     motion = Motion.of(source)
     metrics = [judgement_row(judgement), Metric("model", name), *transfer_figures(source)]
     write_motion_folder(context.folder, motion, body)
@@ -71,9 +72,9 @@ def bring(path: Path, model: BodyModel, name: str, subject: Subject | None, unit
     return metrics, motion, body, page.section("Figures").figures(metrics)
 
 
-def judge_fit(fit: RetargetingError | None) -> Judgement:
-    """Judge a retargeted motion by the directions of its segments and the lean of its skeleton."""
-    reasons = []
+def judge_fit(fit: RetargetingError | None, twists: Sequence[str]) -> Judgement:
+    """Judge a retargeted motion by its segments, doubts about their twists, and the lean of its skeleton."""
+    reasons = [*twists]
     if fit is not None and fit.angle > MOST:
         worst = int(fit.angles.mean(axis=0).argmax())
         reasons.append(f"segments point {fit.angle:.0f} degrees off on average, that to the {_words(fit.names[worst])} "
@@ -95,6 +96,11 @@ def transfer_figures(found: BodyMotion) -> list[Metric]:
                 Metric("travel scaled by", found.brought.scale)]
         if found.brought.lacking:
             out.append(Metric("parts without a joint in the motion", ", ".join(found.brought.lacking)))
+    # bones whose twist their elbow or knee told
+    if found.twist is not None and found.twist.rolled.any():
+        rolled = [f"{part} {angle:.0f}°" for part, angle in zip(found.twist.parts, found.twist.rolled, strict=True)
+                  if angle]
+        out.append(Metric("bones rolled otherwise at rest, allowed for", ", ".join(rolled)))
     # errors of joint centres and of the directions of segments
     if found.fit is not None:
         distance = MM * found.fit.distances
