@@ -18,7 +18,7 @@ from scanprep import write_mesh
 from scanprep.geometry.storage import StorageError
 
 WRITTEN = {"motion.npz", "animation.glb", "motion.bvh", "joint_angles.csv", "joint_centres.csv", "report.html",
-           "report.json", "motion.trc", "motion.mot"}
+           "report.json", "motion.trc", "motion.mot", "anatomical_angles.csv"}
 
 
 @pytest.fixture(scope="module")
