@@ -17,9 +17,10 @@ VIDEO = ("nose|eye|eyeinner|eyeouter|ear|mouth|bigtoe|smalltoe|footindex|pinky|i
          r"(hip|knee|ankle|shoulder|elbow|wrist)(joint|cent(er|re)|jointcent(er|re))|[hkasew]jc")
 SIDED = re.compile(rf"(?P<front>left|right|l|r)?(?P<word>{JOINTS}|{ENDS}|{VIDEO})(?P<back>left|right|l|r)?"
                    r"(?P<joint>joint)?")
-# Hips apart, in lengths of the thigh: joint centres of synthetic people had 0.46 to 0.66, trochanters 0.77 to 1.15.
-# Markers at the front of the pelvis had 0.52 to 0.72, so no distance tells them from centres: names must
-WIDEST = 0.70
+# Hips apart, in lengths of the thigh: joint centres of 42 synthetic people had 0.44 to 0.66, and 0.80 once; trochanters
+# of 18 had 0.72 to 1.15, markers at the front of the pelvis 0.52 to 0.76. Above WIDEST are trochanters, below NARROW is
+# no marker; between them names must tell
+WIDEST, NARROW = 0.70, 0.50
 # what the motions of six synthetic people in a video were off, taken for markers of helenhayes29
 USE = ("joint centres of a video, not markers on skin. Girths and volume are a guess, stature may be 10 cm and joint "
        "angles 10 degrees off: for a body, record markers on skin (scape layout list)")
@@ -71,9 +72,9 @@ def find_keypoints(labels: Collection[str], used: Collection[str] = (), hips: fl
     share = len(counted & plain) / max(len(counted), 1)
     if share < 0.75 or len(video) + len(sided) < 3:
         return ()
-    # three words of a video are enough. Fewer need hips as near to each other as centres are, and plain names alone a
-    # set in which nearly every label is one
-    if len(video) >= 3 or (hips is not None and hips < WIDEST and (video or share >= 0.9)):
+    # three words of a video are enough, fewer need hips that are not as far apart as trochanters; names of joints alone
+    # need hips nearer to each other than any marker is
+    if len(video) >= 3 or (hips is not None and hips < (WIDEST if video else NARROW)):
         return tuple([*video.values(), *sided.values()][:3])
     return ()
 

@@ -30,7 +30,7 @@ def read_recordings(recordings: Recording | Sequence[Recording]) -> list[MarkerS
     return [each if isinstance(each, MarkerSequence) else read_markers(each) for each in every]
 
 
-def built_in_people() -> BodyModel:
+def load_default_model() -> BodyModel:
     """Return the model of the built-in people, for whoever names none."""
     from model.files import BUILT_IN, load_model  # imported here, as it loads the learning code
 

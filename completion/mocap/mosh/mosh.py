@@ -30,7 +30,7 @@ from ..soft_tissue.follow import SoftTissueConfig, follow_soft_tissue
 from ..soft_tissue.soft_tissue import SoftTissue
 from ..subject.misplaced_markers import MisplacedMarkers, find_misplaced_markers
 from ..subject.person import PersonConfig, PersonFit, find_person
-from .inputs import Recording, built_in_people, read_recordings, recognise_layout
+from .inputs import Recording, load_default_model, read_recordings, recognise_layout
 
 T = TypeVar("T")
 STEPS = 100                          # steps of progress for each stage
@@ -223,7 +223,7 @@ def mosh(recordings: Recording | Sequence[Recording], model: BodyModel | None = 
     """
     # recordings of files are read, the set is recognised, and the built-in people are the model where none is named
     config, sequences = config or MoshConfig(), read_recordings(recordings)
-    model = built_in_people() if model is None else model
+    model = load_default_model() if model is None else model
     layout = recognise_layout(model, layout, sequences)
     trials = [_Trial(i, each, each) for i, each in enumerate(sequences)]
     stages = _Stages(model, config, step, progress, STEPS * (1 + len(trials) * (2 + config.soft_tissue)))
