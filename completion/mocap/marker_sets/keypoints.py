@@ -21,9 +21,10 @@ SIDED = re.compile(rf"(?P<front>left|right|l|r)?(?P<word>{JOINTS}|{ENDS}|{VIDEO}
 # of 18 had 0.72 to 1.15, markers at the front of the pelvis 0.52 to 0.76. Above WIDEST are trochanters, below NARROW is
 # no marker; between them names must tell
 WIDEST, NARROW = 0.70, 0.50
-# what the motions of six synthetic people in a video were off, taken for markers of helenhayes29
-USE = ("joint centres of a video, not markers on skin. Girths and volume are a guess, stature may be 10 cm and joint "
-       "angles 10 degrees off: for a body, record markers on skin (scape layout list)")
+CENTRES = "joint centres of a video, not markers on skin"
+REMEDY = "for a body, record markers on skin (scape layout list)"
+# what six synthetic people in a video were off, taken for people with markers of helenhayes29
+USE = f"{CENTRES}. Girths and volume are a guess, stature may be 10 cm and joint angles 10 degrees off: {REMEDY}"
 
 
 def parse_keypoint(label: str) -> tuple[str, str] | None:

@@ -12,10 +12,10 @@ from ..marker_sets.keypoints import USE, find_keypoints, measure_hips
 from ..marker_sets.layout import MarkerLayout
 from ..marker_sets.named import choose_layout
 
-Recording = str | Path | MarkerSequence
+MarkerSource = str | Path | MarkerSequence
 
 
-def read_recordings(recordings: Recording | Sequence[Recording]) -> list[MarkerSequence]:
+def read_recordings(recordings: MarkerSource | Sequence[MarkerSource]) -> list[MarkerSequence]:
     """Read the recordings that are files, and return all as sequences.
 
     Raises
@@ -23,7 +23,7 @@ def read_recordings(recordings: Recording | Sequence[Recording]) -> list[MarkerS
     ValueError
         No recording, something else than a file or a sequence, and as `read_markers`.
     """
-    every = [recordings] if isinstance(recordings, Recording) else recordings
+    every = [recordings] if isinstance(recordings, MarkerSource) else recordings
     if not isinstance(every, Sequence) or not every:
         raise ValueError("recordings: expected a file of markers, a MarkerSequence, or a list of at least one of "
                          f"these, got {'none' if isinstance(every, Sequence) else type(every).__name__}")

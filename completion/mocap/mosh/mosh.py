@@ -30,7 +30,7 @@ from ..soft_tissue.follow import SoftTissueConfig, follow_soft_tissue
 from ..soft_tissue.soft_tissue import SoftTissue
 from ..subject.misplaced_markers import MisplacedMarkers, find_misplaced_markers
 from ..subject.person import PersonConfig, PersonFit, find_person
-from .inputs import Recording, load_default_model, read_recordings, recognise_layout
+from .inputs import MarkerSource, load_default_model, read_recordings, recognise_layout
 
 T = TypeVar("T")
 STEPS = 100                          # steps of progress for each stage
@@ -169,7 +169,7 @@ class MoshResult:
 
 
 @one_thread()
-def mosh(recordings: Recording | Sequence[Recording], model: BodyModel | None = None,
+def mosh(recordings: MarkerSource | Sequence[MarkerSource], model: BodyModel | None = None,
          layout: MarkerLayout | str | Path | None = None, config: MoshConfig | None = None,
          progress: Progress | None = None, step: Step = run_uncached) -> MoshResult:
     """Compute body shape, marker places, poses and soft tissue of one subject from recordings of markers.
