@@ -23,8 +23,8 @@ SIDED = re.compile(rf"(?P<front>left|right|l|r)?(?P<word>{JOINTS}|{ENDS}|{VIDEO}
 WIDEST, NARROW = 0.70, 0.50
 CENTRES = "joint centres of a video, not markers on skin"
 REMEDY = "for a body, record markers on skin (scape layout list)"
-# what six synthetic people in a video were off, taken for people with markers of helenhayes29
-USE = f"{CENTRES}. Girths and volume are a guess, stature may be 10 cm and joint angles 10 degrees off: {REMEDY}"
+# what eleven synthetic people in a video were off, taken for people with markers of helenhayes29; one knee 33 degrees
+USE = f"{CENTRES}. Girths and volume are a guess, stature may be 10 cm, angles 10 degrees and more off: {REMEDY}"
 
 
 def parse_keypoint(label: str) -> tuple[str, str] | None:
