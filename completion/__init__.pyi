@@ -6,6 +6,7 @@ from .mocap.files.markers import read_markers as read_markers
 from .mocap.files.markers import write_markers as write_markers
 from .mocap.files.motion_files import joint_angles as joint_angles
 from .mocap.files.motion_files import joint_centres as joint_centres
+from .mocap.joint_angles import angle_table as angle_table
 from .mocap.labelling.label import label_markers as label_markers
 from .mocap.labelling.label import label_people as label_people
 from .mocap.labelling.stream import LabelStream as LabelStream

@@ -233,7 +233,7 @@ def test_everything_together():
     """The motion of every frame comes back; residual columns are those of the file."""
     data = sequence(displaced())
     more = MarkerSequence(np.concatenate([data.positions, data.positions[:, :1] + 1], axis=1), (*LABELS, "prop"), 60.0)
-    found = mosh(MODEL, more, LAYOUT, MoshConfig(person=USUAL, soft_tissue=False))
+    found = mosh(more, MODEL, LAYOUT, MoshConfig(person=USUAL, soft_tissue=False))
     assert len(found.motions) == len(found.artefacts) == 1 and found.soft_tissue == ()
     assert found.motions[0].labels == more.labels and np.isnan(found.motions[0].residuals[:, -1]).all()
     assert np.nanmean(found.motions[0].residuals) < 5e-3 and not found.artefacts[0].swaps
@@ -249,7 +249,7 @@ def test_labels_that_were_exchanged_do_not_spoil_the_person():
     swapped, T = data.positions.copy(), len(data.positions)
     some = np.arange(T // 3, 2 * T // 3)
     swapped[np.ix_(some, [0, 7])] = swapped[np.ix_(some, [7, 0])]
-    found = mosh(MODEL, MarkerSequence(swapped, data.labels, data.rate), LAYOUT,
+    found = mosh(MarkerSequence(swapped, data.labels, data.rate), MODEL, LAYOUT,
                  MoshConfig(person=USUAL, soft_tissue=False))
     swap, = found.artefacts[0].swaps
     assert {swap.first, swap.second} == {LABELS[0], LABELS[7]} and (swap.begin, swap.end) == (some[0], some[-1])
@@ -263,7 +263,7 @@ def worn_otherwise(row, places, exchanged=()):
     data[:, row] = places
     for i, j in exchanged:
         data[:, [i, j]] = data[:, [j, i]]
-    return mosh(MODEL, MarkerSequence(data, LABELS, 60.0), LAYOUT, MoshConfig(person=USUAL, soft_tissue=False))
+    return mosh(MarkerSequence(data, LABELS, 60.0), MODEL, LAYOUT, MoshConfig(person=USUAL, soft_tissue=False))
 
 
 def test_a_marker_worn_elsewhere_and_a_pair_of_exchanged_names_are_put_right():
@@ -374,7 +374,7 @@ def test_the_published_preset_is_the_patent():
     assert (120**2 / poses.angle_acceleration)**2 == pytest.approx(6.25)
     assert (soft.data, soft.pose, soft.velocity, found.repair) == (0.75, 1, 6.25, False)
     data = sequence(displaced())
-    result = mosh(MODEL, data, LAYOUT, replace(found, person=replace(person, frames=8, annealing=(10.0, 4.0, 1.0))))
+    result = mosh(data, MODEL, LAYOUT, replace(found, person=replace(person, frames=8, annealing=(10.0, 4.0, 1.0))))
     assert not result.artefacts[0].swaps and not result.artefacts[0].bad
     np.testing.assert_array_equal(result.artefacts[0].repaired.positions, data.positions)
     body = result.soft_tissue[0].vertices(MODEL)

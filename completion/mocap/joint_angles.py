@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from itertools import product
+from typing import Any
 
 import numpy as np
 
@@ -255,6 +256,45 @@ def angle_doubts(motion: Motion, subject: Subject, told: np.ndarray) -> tuple[st
         return anatomical_angles(motion, subject, subject.joints(motion.poses, motion.trans), Known(told)).doubts()
     except ValueError:
         return ()
+
+
+def angle_table(motion: Motion, subject: Subject, told: np.ndarray | None = None) -> Any:
+    """Compute the ISB joint angles of a person in motion as a table of named columns.
+
+    Parameters
+    ----------
+    motion : Motion
+        Poses (T, J, 3) in radians.
+    subject : Subject
+        The body that moves, with the parts of a person.
+    told : (J,) bool, optional
+        Parts that the markers determine; angles of the others are left out.
+
+    Returns
+    -------
+    pandas.DataFrame, or {str: (T,) float} where pandas is not installed
+        "time" in seconds, and the angles of `motion.mot` in degrees, such as "knee_angle_r".
+
+    Raises
+    ------
+    ValueError
+        A body whose parts lack the names of a person's.
+
+    Examples
+    --------
+    >>> from model import load_built_in_model
+    >>> still = Motion(np.zeros((2, 16, 3)), np.zeros((2, 3)), None, 100.0, np.zeros((2, 0)))
+    >>> table = angle_table(still, load_built_in_model().subject())
+    >>> float(table["time"][1]), abs(float(table["lumbar_extension"][0])) < 1e-9
+    (0.01, True)
+    """
+    angles = anatomical_angles(motion, subject, subject.joints(motion.poses, motion.trans), told)
+    columns = {"time": motion.times, **dict(zip(angles.names, angles.degrees.T, strict=True))}
+    try:
+        import pandas  # optional: nothing else here needs it
+    except ImportError:
+        return columns
+    return pandas.DataFrame(columns)
 
 
 def rest_joints(subject: Subject) -> np.ndarray:

@@ -86,7 +86,7 @@ def walking(model: Any, own: np.ndarray, people: list[Any], frames: int) -> dict
         subject = model.subject(fit_shape(model, person.mesh.vertices[own]).betas)
         motion, seconds = tried(lambda: animate(subject, seen, layout))                                 # noqa: B023
         rows["markers, shape known"].append((_off(motion.vertices(subject), bodies), seconds))
-        found, seconds = tried(lambda: mosh(model, seen, layout))                                       # noqa: B023
+        found, seconds = tried(lambda: mosh(seen, model, layout))                                       # noqa: B023
         rows["MoSh"].append((_off(found.motions[0].vertices(model.subject(found.betas)), bodies), seconds))
     return {name: dict(zip(("mean_mm", "seconds"), np.mean(each, axis=0).tolist(), strict=True))
             for name, each in rows.items()}

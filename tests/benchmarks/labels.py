@@ -100,7 +100,7 @@ def mosh_ratio(model: BodyModel, layout: MarkerLayout, places: np.ndarray, rate:
     frames, columns = np.nonzero(truth >= 0)
     true[frames, truth[frames, columns]] = points[frames, columns]
     both = found, MarkerSequence(true, layout.labels, rate)
-    motions = [mosh(model, markers, layout).motions[0] for markers in both]
+    motions = [mosh(markers, model, layout).motions[0] for markers in both]
     # both by the true observations, whatever they were labelled
     seen = np.isfinite(true[..., 0]) & np.isfinite(motions[0].residuals) & np.isfinite(motions[1].residuals)
     off = [1000 * float(motion.residuals[seen].mean()) for motion in motions]

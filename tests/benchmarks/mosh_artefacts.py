@@ -235,7 +235,7 @@ def run_exchanges(model: BodyModel, case: Case, faulty: Faulty, reference: np.nd
     subject = model.subject(person.betas)
     raw = animate(subject, faulty.markers, person.layout, POSES)
     start = time.process_time()
-    result = mosh(model, faulty.markers, case.layout, MoshConfig(artefacts=config, soft_tissue=False))
+    result = mosh(faulty.markers, model, case.layout, MoshConfig(artefacts=config, soft_tissue=False))
     seconds, found = time.process_time() - start, result.artefacts[0]
     mended = model.subject(result.betas), result.layout, result.motions[0]
     away = [float(np.linalg.norm(surface(s, m) - reference, axis=2).mean())

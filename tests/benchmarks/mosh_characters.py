@@ -131,7 +131,7 @@ def main() -> None:
     model = load_model(args.model) if args.model else load_built_in_model()
     markers, layout = walking_man(model, 120, 60.0) if args.c3d is None else \
         (read_markers(args.c3d), load_layout("cmu41", model.template))
-    soft = mosh(model, markers, layout).soft_tissue[0]
+    soft = mosh(markers, model, layout).soft_tissue[0]
     frames = np.unique(np.linspace(0, len(soft.motion.poses) - 1, args.frames).round().astype(int))
     rows = []
     for name in CARTOONS:

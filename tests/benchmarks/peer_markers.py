@@ -76,7 +76,7 @@ def fixed_shape(model_file: str, markers: MarkerSequence, layout: MarkerLayout) 
     """`mosh` with a fixed shape, as the fields of `Solved`."""
     model = load_model(model_file)
     start = processor_seconds()
-    found = mosh(model, markers, layout, MoshConfig(soft_tissue=False))
+    found = mosh(markers, model, layout, MoshConfig(soft_tissue=False))
     cpu_s, motion, subject = processor_seconds() - start, found.motions[0], model.subject(found.betas)
     body = MarkedBody(subject, found.layout.select(layout.match_labels(markers.labels)), 0.0, 0.0)
     return (body.positions(body.body.join(motion.poses, motion.trans)), model.skeleton.part_rotations(motion.poses),

@@ -19,6 +19,7 @@ from scanprep.judgement import size
 from scanprep.skeleton.tree import Skeleton
 
 from ..files.text import MarkerFileError
+from .keypoints import CENTRES, REMEDY, find_keypoints
 from .layout import MarkerLayout
 from .opensim import opensim_places
 
@@ -133,6 +134,8 @@ def fitting_layout(labels: Sequence[str], template: Mesh, kept: np.ndarray | Non
     fewest = 3  # least known labels
     if known[best] < fewest:
         told = ", ".join(f"{name} {count}" for name, count in sorted(known.items(), key=lambda item: -item[1]))
+        if keypoints := find_keypoints(labels):
+            raise ValueError(f"labels: {', '.join(keypoints)} are {CENTRES}, and no marker set has them: {REMEDY}")
         raise ValueError(f"labels: expected at least {fewest} of a marker set, of these {len(labels)} the sets know "
                          f"{told}. The sets: scape layout list, scape layout show NAME; your own: --layout FILE, which "
                          f"scape pick makes of the model's template. Labels found: {', '.join(labels) or 'none'}")

@@ -5,6 +5,7 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
@@ -20,13 +21,16 @@ from ...motion import Motion, Progress
 from ..artefacts.find import find_artefacts, no_artefacts, relabel_by_tracks
 from ..artefacts.results import ArtefactConfig, MarkerArtefacts
 from ..files.markers import MarkerSequence
+from ..joint_angles import angle_table
 from ..marker_sets.layout import MarkerLayout
+from ..pose.coverage import find_coverage
 from ..pose.follow import animate
 from ..pose.marked_body import RATE, AnimateConfig
 from ..soft_tissue.follow import SoftTissueConfig, follow_soft_tissue
 from ..soft_tissue.soft_tissue import SoftTissue
 from ..subject.misplaced_markers import MisplacedMarkers, find_misplaced_markers
-from ..subject.person import PersonConfig, PersonFit, find_person, one_or_more
+from ..subject.person import PersonConfig, PersonFit, find_person
+from .inputs import MarkerSource, load_default_model, read_recordings, recognise_layout
 
 T = TypeVar("T")
 STEPS = 100                          # steps of progress for each stage
@@ -108,6 +112,8 @@ class MoshResult:
 
     Attributes
     ----------
+    model : BodyModel
+        The model of which the person is.
     betas : (k,) float, standard deviations
         Shape of the person.
     layout : MarkerLayout
@@ -132,13 +138,16 @@ class MoshResult:
     >>> layout = load_layout("cmu41", model.template, np.array(model.info["people_vertices"]))
     >>> still = MarkerSequence(np.stack([layout.place(model.template)] * 4), layout.labels, 120.0)
     >>> quick = MoshConfig(PersonConfig(frames=2, n_betas=3, annealing=(10.0, 1.0)), soft_tissue=False, repair=False)
-    >>> result = mosh(model, still, layout, quick)
+    >>> result = mosh(still, config=quick)
     >>> result.betas.shape, sorted(result.seconds)
     ((3,), ['person', 'poses'])
+    >>> result.joint_angles()["knee_angle_r"].shape
+    (4,)
 
     [MoSh] Eq. 23, Eq. 24
     """
 
+    model: BodyModel
     betas: np.ndarray
     layout: MarkerLayout
     person: PersonFit
@@ -148,11 +157,22 @@ class MoshResult:
     misplaced: MisplacedMarkers = field(default_factory=MisplacedMarkers)
     seconds: dict[str, np.ndarray] = field(default_factory=dict)
 
+    @cached_property
+    def subject(self) -> Subject:
+        """The body of the person."""
+        return self.model.subject(self.betas)
+
+    def joint_angles(self, number: int = 0) -> Any:
+        """Return the ISB joint angles of a motion as `angle_table` does, without those that no marker determines."""
+        told = find_coverage(self.subject, self.layout, self.motions, ()).told
+        return angle_table(self.motions[number], self.subject, told)
+
 
 @one_thread()
-def mosh(model: BodyModel, sequences: MarkerSequence | Sequence[MarkerSequence], layout: MarkerLayout,
-         config: MoshConfig | None = None, progress: Progress | None = None, step: Step = run_uncached) -> MoshResult:
-    """Compute body shape, marker places, poses and soft tissue of one subject from marker sequences.
+def mosh(recordings: MarkerSource | Sequence[MarkerSource], model: BodyModel | None = None,
+         layout: MarkerLayout | str | Path | None = None, config: MoshConfig | None = None,
+         progress: Progress | None = None, step: Step = run_uncached) -> MoshResult:
+    """Compute body shape, marker places, poses and soft tissue of one subject from recordings of markers.
 
     Labels are corrected as far as tracks tell. The person is found from a few frames of all sequences; misplaced
     markers are searched on the whole body. Then the pose of every frame is solved. The motion tells which labels were
@@ -161,12 +181,13 @@ def mosh(model: BodyModel, sequences: MarkerSequence | Sequence[MarkerSequence],
 
     Parameters
     ----------
-    model : BodyModel
-        With betas.
-    sequences : MarkerSequence, or several of one subject
-        Positions (T, L, 3) in metres.
-    layout : MarkerLayout
-        Where markers usually sit on the model's template. Markers that are only in one of the two are left out.
+    recordings : str, Path or MarkerSequence, or several of one subject
+        Files as `read_markers` reads them, or positions (T, L, 3) in metres.
+    model : BodyModel, optional
+        With betas; without it that of the built-in people.
+    layout : MarkerLayout, str or Path, optional
+        Where markers usually sit on the model's template: also a name of `layout_names()`, or a file. Without it the
+        named one that fits the labels best. Markers that are only in one of the two are left out.
     config : MoshConfig, optional
         Settings.
     progress : callable, optional
@@ -182,8 +203,8 @@ def mosh(model: BodyModel, sequences: MarkerSequence | Sequence[MarkerSequence],
     Raises
     ------
     ValueError
-        A model without betas, no sequence, fewer than 3 markers in common, no frame with 3 of them, a layout of
-        another body.
+        A model without betas, no recording or one that cannot be read, fewer than 3 markers in common, no frame with 3
+        of them, a layout of another body.
 
     Examples
     --------
@@ -192,14 +213,19 @@ def mosh(model: BodyModel, sequences: MarkerSequence | Sequence[MarkerSequence],
     >>> model = load_built_in_model()
     >>> layout = load_layout("cmu41", model.template, np.array(model.info["people_vertices"]))
     >>> still = MarkerSequence(np.stack([layout.place(model.template)] * 4), layout.labels, 120.0)
+    >>> write_markers("still.c3d", still)
     >>> quick = PersonConfig(frames=2, n_betas=3, annealing=(10.0, 1.0))
-    >>> mosh(model, still, layout, MoshConfig(quick, soft_tissue=False, repair=False)).motions[0].poses.shape
+    >>> result = mosh("still.c3d", config=MoshConfig(quick, soft_tissue=False, repair=False))
+    >>> result.motions[0].poses.shape
     (4, 16, 3)
 
     [MoSh] Eq. 23, Eq. 24
     """
-    config = config or MoshConfig()
-    trials = [_Trial(i, each, each) for i, each in enumerate(one_or_more(sequences))]
+    # recordings of files are read, the set is recognised, and the built-in people are the model where none is named
+    config, sequences = config or MoshConfig(), read_recordings(recordings)
+    model = load_default_model() if model is None else model
+    layout = recognise_layout(model, layout, sequences)
+    trials = [_Trial(i, each, each) for i, each in enumerate(sequences)]
     stages = _Stages(model, config, step, progress, STEPS * (1 + len(trials) * (2 + config.soft_tissue)))
 
     # shape and marker places from some frames, with labels corrected by tracks; then misplaced markers
@@ -232,7 +258,7 @@ def mosh(model: BodyModel, sequences: MarkerSequence | Sequence[MarkerSequence],
             stages.find_soft_tissue(trial, person)                              # [MoSh] Eq. 24
     # collect the results, artefacts in the labels of the original recordings
     every = [trial.result() for trial in trials]
-    return MoshResult(person.fit.betas, person.fit.layout, person.fit, tuple(motion for motion, _, _ in every),
+    return MoshResult(model, person.fit.betas, person.fit.layout, person.fit, tuple(motion for motion, _, _ in every),
                       tuple(soft for _, soft, _ in every if soft is not None), tuple(found for *_, found in every),
                       misplaced, stages.seconds)
 
@@ -413,7 +439,7 @@ def mosh_by_sex(models: Mapping[str, BodyModel], sequences: MarkerSequence | Seq
     config = config or MoshConfig()
     neutral = find_person(models["neutral"], sequences, layout, config.person, None, substeps(step, "neutral"))
     guess = guess_sex(models["neutral"], neutral.betas)
-    result = mosh(models[guess.sex], sequences, layout, config, progress, step)
+    result = mosh(sequences, models[guess.sex], layout, config, progress, step)
     motions = tuple(replace(motion, gender=guess.sex) for motion in result.motions)
     soft = tuple(replace(one, motion=replace(one.motion, gender=guess.sex)) for one in result.soft_tissue)
     return SexedMosh(guess, models[guess.sex], neutral, replace(result, motions=motions, soft_tissue=soft))

@@ -206,7 +206,7 @@ def _solve(work: MoshTask, actor: Actor, context: TaskContext) -> tuple[_Found, 
                              context.step)
         model, guess, result = by_sex.model, by_sex.guess, by_sex.result
     else:
-        result = mosh(model, sequences, layout, work.config, progress, context.step)
+        result = mosh(sequences, model, layout, work.config, progress, context.step)
     # a take for each sequence, with distances from held-out markers
     subject = model.subject(result.betas)
     light, takes = LightMesh.of(model.template), []

@@ -14,6 +14,7 @@ from scanprep.skeleton.tree import Skeleton
 
 from ...motion import Motion
 from ..files.markers import MarkerSequence
+from ..marker_sets.keypoints import USE, find_keypoints, measure_hips
 from ..marker_sets.layout import MarkerLayout
 
 # points that Plug-in Gait computes: centres of mass, and for every segment its origin and the ends of three axes
@@ -39,6 +40,8 @@ class Coverage:
         Names of the parts whose poses are guesses.
     skin : float
         Share of the skin on the unseen parts.
+    keypoints : tuple of str
+        Labels that tell that the points are joint centres of a video; none where they are markers on skin.
     """
 
     used: tuple[str, ...]
@@ -47,6 +50,7 @@ class Coverage:
     parts: tuple[str, ...]
     unseen: tuple[str, ...]
     skin: float
+    keypoints: tuple[str, ...] = ()
 
     def metrics(self) -> list[Metric]:
         """Return the rows of the table: markers used, and parts without markers."""
@@ -56,14 +60,14 @@ class Coverage:
 
     def judgement(self) -> Judgement:
         """Judge whether the markers determine a body."""
-        failed, check = [], []
+        failed, check = [], [f"{', '.join(self.keypoints)}: {USE}"] if self.keypoints else []
         used = f"{len(self.used)} of {self.count} markers used"
         fewest = 8  # least markers for a body; six determine a pelvis and a head, but no limb
         if len(self.used) < fewest:
             failed.append(f"{used}, a body needs {fewest}: other labels than the marker set's? (scape layout show)")
         elif len(self.parts) < 2:
             failed.append(f"all markers used are on one part of the body, the {self.parts[0]}")
-        elif len(self.used) < 0.5 * self.count:
+        elif len(self.used) < 0.5 * self.count and not self.keypoints:
             check.append(f"{used}: other labels than the marker set's? (scape layout show)")
         # 0.25 of the skin: both hands have 5%, a head 7%, all above the waist 60%
         if self.skin > 0.25:
@@ -94,6 +98,7 @@ def find_coverage(subject: Subject, layout: MarkerLayout, motions: Sequence[Moti
     # a trajectory counts as a marker when it is seen in a tenth of the frames
     lasting = {label for one in markers for label, share in zip(one.labels, one.seen.mean(axis=0), strict=True)
                if share >= 0.1 and label in marker_labels(one.labels)}
+    keypoints = find_keypoints([label for one in markers for label in one.labels], used, measure_hips(markers))
     doubted = {label for motion in motions for label in motion.distrusted}
     # parts with a trusted marker, and those that follow from them
     known = {layout.aliases.get(label, label) for label in used - doubted}
@@ -103,7 +108,7 @@ def find_coverage(subject: Subject, layout: MarkerLayout, motions: Sequence[Moti
     area = np.bincount(skeleton.part_of_face, body.face_areas, minlength=len(told))
     names = np.array(skeleton.names)
     return Coverage(tuple(sorted(used)), len(lasting | used), told, tuple(names[seen].tolist()),
-                    tuple(names[~told].tolist()), float(area[~told].sum() / area.sum()))
+                    tuple(names[~told].tolist()), float(area[~told].sum() / area.sum()), keypoints)
 
 
 def marker_labels(labels: Iterable[str]) -> set[str]:
