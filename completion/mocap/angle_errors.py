@@ -7,7 +7,6 @@ from model.linear import Subject
 from scanprep.threads import one_thread
 
 from ..motion import Motion
-from .files.markers import MarkerSequence
 from .joint_angles import SegmentAxes, anatomy, angles_of, ground_axes, rest_joints
 from .marker_sets.layout import MarkerLayout
 from .pose.marked_body import MarkedBody
@@ -21,8 +20,8 @@ TOGETHER, OF_THE_BODY, OF_THE_ZERO = 1.0, 1.2, 6.5
 
 
 @one_thread()
-def expect_angle_errors(motion: Motion, subject: Subject, layout: MarkerLayout, markers: MarkerSequence,
-                        static: bool = False) -> np.ndarray | None:
+def expect_angle_errors(motion: Motion, subject: Subject, layout: MarkerLayout, static: bool = False
+                        ) -> np.ndarray | None:
     """Compute the expected error (T, K) of every joint angle of a person, degrees, root mean square; None of others.
 
     Parameters
@@ -33,8 +32,6 @@ def expect_angle_errors(motion: Motion, subject: Subject, layout: MarkerLayout, 
         The person.
     layout : MarkerLayout
         Where the markers sit on this person.
-    markers : MarkerSequence
-        Positions (T, L, 3), metres.
     static : bool
         The angles are zero in a static trial, so the zero of the body does not count.
 
@@ -49,9 +46,8 @@ def expect_angle_errors(motion: Motion, subject: Subject, layout: MarkerLayout, 
     >>> from model import load_built_in_model
     >>> model = load_built_in_model()
     >>> layout = load_layout("cmu41", model.template, np.array(model.info["people_vertices"]))
-    >>> still = MarkerSequence(np.stack([layout.place(model.template)] * 4), layout.labels, 120.0)
     >>> motion = Motion(np.zeros((4, 16, 3)), np.zeros((4, 3)), None, 120.0, np.zeros((4, 41)), layout.labels)
-    >>> expect_angle_errors(motion, model.subject(), layout, still).shape
+    >>> expect_angle_errors(motion, model.subject(), layout).shape
     (4, 48)
     """
     skeleton = subject.skeleton
@@ -64,10 +60,10 @@ def expect_angle_errors(motion: Motion, subject: Subject, layout: MarkerLayout, 
     # some frames, and the information of their trusted markers
     frames = np.unique(np.r_[0:len(motion.poses):max(1, round(EVERY * motion.rate)), len(motion.poses) - 1])
     x = body.body.join(motion.poses[frames], motion.trans[frames])
-    targets, trusted = markers.positions[frames][:, columns], motion.trusted[np.ix_(frames, columns)]
+    trusted = motion.trusted[np.ix_(frames, columns)]
     off = motion.residuals[motion.trusted]
     sd = max(LEAST, float(np.sqrt((off**2).mean() / 3)) if len(off) else LEAST)
-    information = body.system(x, np.where(trusted[..., None], targets, np.nan), trusted / sd**2).hessian
+    information = body.system(x, body.positions(x), trusted / sd**2).hessian
     # neighbours tell of a frame too, so gaps of a moment are bridged
     total = np.concatenate([np.zeros_like(information[:1]), np.cumsum(information, axis=0)])
     low, high = (np.clip(np.arange(len(x)) + step, 0, len(x)) for step in (-AROUND, AROUND + 1))

@@ -113,6 +113,15 @@ class JointAngles:
     guessed: tuple[str, ...] = ()    # angles that the markers never determine, which are left out
     errors: np.ndarray | None = None         # (T, K) degrees, expected, root mean square, NaN as the angles
 
+    def columns(self, rate: float) -> dict[str, np.ndarray]:
+        """Return the columns (T,) of a table by name: time in seconds, angles in degrees, and their errors, if any."""
+        out = {"time": np.arange(len(self.degrees)) / rate}
+        for k, name in enumerate(self.names):
+            out[name] = self.degrees[:, k]
+            if self.errors is not None:
+                out[f"{name}_sd"] = self.errors[:, k]
+        return out
+
     def doubts(self) -> tuple[str, ...]:
         """Return reasons to look: angles that people do not have, with their frames, the longest first."""
         found = []
@@ -258,7 +267,7 @@ def angle_doubts(motion: Motion, subject: Subject, told: np.ndarray) -> tuple[st
         return ()
 
 
-def angle_table(motion: Motion, subject: Subject, told: np.ndarray | None = None) -> Any:
+def angle_table(motion: Motion, subject: Subject, known: Known = NOTHING_KNOWN) -> Any:
     """Compute the ISB joint angles of a person in motion as a table of named columns.
 
     Parameters
@@ -267,13 +276,14 @@ def angle_table(motion: Motion, subject: Subject, told: np.ndarray | None = None
         Poses (T, J, 3) in radians.
     subject : Subject
         The body that moves, with the parts of a person.
-    told : (J,) bool, optional
-        Parts that the markers determine; angles of the others are left out.
+    known : Known, optional
+        Parts that the markers determine, and errors; other angles are NaN, or left out where they always are.
 
     Returns
     -------
     pandas.DataFrame, or {str: (T,) float} where pandas is not installed
-        "time" in seconds, and the angles of `motion.mot` in degrees, such as "knee_angle_r".
+        The columns of `anatomical_angles.csv`: "time" in seconds, and angles in degrees, such as "knee_angle_r", each
+        with its expected error, "knee_angle_r_sd", if known.
 
     Raises
     ------
@@ -288,8 +298,7 @@ def angle_table(motion: Motion, subject: Subject, told: np.ndarray | None = None
     >>> float(table["time"][1]), abs(float(table["lumbar_extension"][0])) < 1e-9
     (0.01, True)
     """
-    angles = anatomical_angles(motion, subject, subject.joints(motion.poses, motion.trans), told)
-    columns = {"time": motion.times, **dict(zip(angles.names, angles.degrees.T, strict=True))}
+    columns = anatomical_angles(motion, subject, subject.joints(motion.poses, motion.trans), known).columns(motion.rate)
     try:
         import pandas  # optional: nothing else here needs it
     except ImportError:

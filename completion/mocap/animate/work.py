@@ -129,7 +129,7 @@ class AnimateTask:
         metrics = [judgement_row(judgement), *metrics, *covered.metrics(),
                    *untold_spans(body.skeleton, told, motion.rate), *motion_figures(motion)]
         write_motion_folder(output, motion, body, remove_distrusted(motion, sequence),
-                            Known(told, expect_angle_errors(motion, body, layout, sequence)))
+                            Known(told, expect_angle_errors(motion, body, layout)))
         metrics += write_glb(output / "animation.glb", motion, body)
         page = motion_page(motion, body, sequence, path.name, metrics)
         if self.unlabelled:

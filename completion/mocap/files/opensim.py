@@ -93,14 +93,8 @@ def centre_labels(skeleton: Skeleton) -> tuple[str, ...]:
 
 def write_angles(path: Path, angles: JointAngles, rate: float) -> None:
     """Write joint angles in degrees as CSV, each beside its expected error, NAME_sd; empty where not determined."""
-    columns, names = [np.arange(len(angles.degrees)) / rate], ["time"]
-    for k, name in enumerate(angles.names):
-        columns.append(angles.degrees[:, k])
-        names.append(name)
-        if angles.errors is not None:
-            columns.append(angles.errors[:, k])
-            names.append(f"{name}_sd")
-    storage.write_file(path, tables.number_table(names, np.stack(columns, axis=1)))
+    columns = angles.columns(rate)
+    storage.write_file(path, tables.number_table([*columns], np.stack([*columns.values()], axis=1)))
 
 
 def write_mot(path: str | Path, angles: JointAngles, rate: float) -> None:

@@ -18,12 +18,13 @@ from scanprep.ranges import Settings
 from scanprep.threads import one_thread
 
 from ...motion import Motion, Progress
+from ..angle_errors import expect_angle_errors
 from ..artefacts.find import find_artefacts, no_artefacts, relabel_by_tracks
 from ..artefacts.results import ArtefactConfig, MarkerArtefacts
 from ..files.markers import MarkerSequence
-from ..joint_angles import angle_table
+from ..joint_angles import Known, angle_table
 from ..marker_sets.layout import MarkerLayout
-from ..pose.coverage import find_coverage
+from ..pose.coverage import find_told_parts
 from ..pose.follow import animate
 from ..pose.marked_body import RATE, AnimateConfig
 from ..soft_tissue.follow import SoftTissueConfig, follow_soft_tissue
@@ -163,9 +164,10 @@ class MoshResult:
         return self.model.subject(self.betas)
 
     def joint_angles(self, number: int = 0) -> Any:
-        """Return the ISB joint angles of a motion as `angle_table` does, without those that no marker determines."""
-        told = find_coverage(self.subject, self.layout, self.motions, ()).told
-        return angle_table(self.motions[number], self.subject, told)
+        """Return the ISB joint angles of a motion as `angle_table` does, with errors; NaN where no marker tells."""
+        motion = self.motions[number]
+        return angle_table(motion, self.subject, Known(find_told_parts(self.subject, self.layout, motion),
+                                                       expect_angle_errors(motion, self.subject, self.layout)))
 
 
 @one_thread()

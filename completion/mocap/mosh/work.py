@@ -288,7 +288,7 @@ def write_take(folder: Path, take: Take, layout: MarkerLayout, told: np.ndarray 
     Returned is the distance of the GLB files from the exact bodies.
     """
     motion, body, soft = take.motion, take.subject, take.soft
-    errors = expect_angle_errors(motion, body, layout, take.markers, zero is not None)
+    errors = expect_angle_errors(motion, body, layout, zero is not None)
     write_motion_folder(folder, motion, body, take.artefacts.virtual(), Known(told, errors, zero))
     exact = write_glb(folder / "animation.glb", take.shown, body, None if soft is None else take.make)
     if soft is not None:
