@@ -464,7 +464,7 @@ MUTATIONS = (
         ("all markers but eight", "len(self.used) < fewest", "len(self.used) > fewest"),
         ("half of the markers", "0.5 * self.count", "self.count / 0.5"),
         ("parts that were seen", "area[~told].sum() / area.sum()", "area[told].sum() / area.sum()"),
-        ("ways up to the root", "way[:way.index(top) + 1]", "way[:]")),
+        ("one neighbour tells", "told | (count >= 2)", "told | (count >= 1)")),
     *of("completion/mocap/files/c3d.py", "completion_markers_c3d completion_markers_files completion_markers_foreign",
         ("DEC numbers four times too large", "astype(np.float64) / 4", "astype(np.float64)"),
         ("whole numbers without scale", "(1.0 if table.kind == \"f4\" else table.scale)\n    positions[",
