@@ -26,9 +26,13 @@ from scanprep.pictures.sheets import save_png
 
 from ...motion_pictures import picture_bodies
 from ..artefacts.results import artefact_table, write_virtual
+from ..files.force_plates import read_ground_reactions, write_ground_reactions
 from ..files.markers import MarkerSequence, read_markers
 from ..files.motion_files import joint_centres, write_glb, write_motion_folder, write_residuals
 from ..files.opensim import centre_sequence, mask_unknown_centres
+from ..gait.cycles import average_cycles, write_gait
+from ..gait.events import find_gait_events
+from ..joint_angles import JointAngles
 from ..labelling.labelled_file import label_first, show_labels
 from ..marker_sets.layout import MarkerLayout
 from ..marker_sets.named import choose_layout
@@ -40,7 +44,7 @@ from .mosh import MoshConfig, MoshResult, clocks, mosh, mosh_by_sex
 from .pictures import person_in_mean_pose
 from .recordings import Actor, Recording
 from .report import closing, person_page, person_picture, take_page, take_picture
-from .takes import LightMesh, Take, measure_held_out
+from .takes import LightMesh, Take, Walk, measure_held_out
 
 # held-out errors first; what is left after soft tissue was fitted to the same markers is small, and no error
 ERRORS = ("held-out error, fixed shape", "held-out error, soft tissue", "markers to the body, fixed shape",
@@ -217,7 +221,7 @@ def _write(work: MoshTask, found: _Found, take: Take, context: TaskContext, sett
     def page(folder: Path) -> None:
         start = time.perf_counter()
         picture = take_picture(take)
-        page = take_page(take, metrics, picture)
+        page = take_page(take, metrics, picture, walk)
         if shown:
             page.section("On a character", "The same rotations of the joints, and feet on the ground when those of the "
                          f"person are; soft tissue taken {factor:g} times.").picture(*shown)
@@ -230,27 +234,30 @@ def _write(work: MoshTask, found: _Found, take: Take, context: TaskContext, sett
         write_report(outcome, work.command, time.perf_counter() - start)
 
     determined = found.covered.told
-    metrics += context.files(f"{take.name} files",
-                             (solved, determined, take.source.path, take.source.who, take.unit, factor),
-                             lambda folder: write_take(place(folder), take, determined, factor))
+    exact, walk = context.files(f"{take.name} files",
+                                (solved, determined, take.source.path, take.source.who, take.unit, factor),
+                                lambda folder: write_take(place(folder), take, determined, factor))
+    metrics += exact
     shown: list[Any] = []
     if (body := work.character) is not None:
-        *shown, exact = context.files(f"{take.name} character", (solved, body, factor),
+        *shown, errors = context.files(f"{take.name} character", (solved, body, factor),
                                       lambda folder: _character(body, take, place(folder), factor))
-        metrics += exact
+        metrics += errors
     start = clocks()
-    context.files(f"{take.name} page", (solved, metrics, settings, shown and (shown, factor)), page)
+    context.files(f"{take.name} page", (solved, metrics, settings, walk, shown and (shown, factor)), page)
     return metrics, clocks() - start
 
 
-def write_take(folder: Path, take: Take, told: np.ndarray | None = None, factor: float = 1.0) -> list[Metric]:
+def write_take(folder: Path, take: Take, told: np.ndarray | None = None, factor: float = 1.0
+               ) -> tuple[list[Metric], Walk]:
     """Write all files of a sequence but its page; exaggerated.glb only for a factor on soft tissue other than 1.
 
     Angles and joint centres between parts that the markers do not determine (`told` (J,) bool) are left out.
-    Returned is the distance of the GLB files from the exact bodies.
+    Returned are the distance of the GLB files from the exact bodies, and what a gait laboratory reads.
     """
     motion, body, soft = take.motion, take.subject, take.soft
-    write_motion_folder(folder, motion, body, take.artefacts.virtual(), told)
+    angles = write_motion_folder(folder, motion, body, take.artefacts.virtual(), told)
+    walk = Walk(None, None) if angles is None else write_walk(folder, take, angles)
     exact = write_glb(folder / "animation.glb", take.shown, body, None if soft is None else take.make)
     if soft is not None:
         soft.save(folder / "soft_tissue.npz")
@@ -271,7 +278,22 @@ def write_take(folder: Path, take: Take, told: np.ndarray | None = None, factor:
         *((b.kind, b.label, b.begin, b.end, f"{b.distance:.4g}") for b in take.artefacts.bad)]
     tables.write_table(folder / "artefacts.csv", ("artefact", "markers", "begin", "end", "distance"),
                        sorted(rows, key=lambda row: (row[2], row[1])))
-    return exact
+    return exact, walk
+
+
+def write_walk(folder: Path, take: Take, angles: JointAngles) -> Walk:
+    """Write gait cycles and events of somebody who walks, and grf.mot of a C3D file with force plates."""
+    path, motion = take.source.path, take.motion
+    events = find_gait_events(motion, take.subject, joint_centres(motion, take.subject), angles, path, take.source.who)
+    gait = None if events is None else average_cycles(angles, motion.rate, events)
+    if gait is not None:
+        write_gait(folder, gait)
+    reactions = None
+    if path.suffix.lower() == ".c3d":
+        reactions = read_ground_reactions(path, angles.ground, motion.rate, take.unit)
+    if reactions is not None:
+        write_ground_reactions(folder / "grf.mot", reactions)
+    return Walk(gait, reactions)
 
 
 def _character(character: BodyModel, take: Take, folder: Path, factor: float) -> tuple[np.ndarray, str, list[Metric]]:
