@@ -94,7 +94,7 @@ def read_file_events(path: Path, rate: float, who: str | None = None) -> list[Ev
     for i, label in enumerate(labels[:len(times) // 2]):
         # "Foot Strike" of the context "Left", "Left Heel Strike", or LHS
         context, subject = (words[i].lower() if i < len(words) else "" for words in (contexts, subjects))
-        short = re.fullmatch(r"([lr])(?:(hs|fs|ic|fc|hc)|to|fo)", label.lower())
+        short = re.fullmatch(r"([lr])(?:([hf][sc]|ic)|[tf]o)", label.lower())
         side = re.search(r"\b(l|r)(?:eft|ight)\b", f"{context} {label.lower()}")
         strike = re.search(r"(foot|heel|initial)[ _-]?(strike|contact|on)", label.lower())
         away = re.search(r"(foot|toe)[ _-]?off", label.lower())
