@@ -17,6 +17,7 @@ from scanprep.geometry.format_common import UNITS
 
 from .c3d import Parameters, file_parameters, first_frame, point_table, read_analog
 from .opensim import write_storage
+from .text import MarkerFileError
 
 LOADED = 10.0                        # N: what presses less on a plate is noise, and its centre of pressure anywhere
 STOOD_ON = 100.0                     # N: a baseline beyond any drift of an amplifier; somebody stands on the plate
@@ -60,19 +61,27 @@ def read_ground_reactions(path: Path, ground: np.ndarray, rate: float, unit: str
     -------
     GroundReactions or None
         A plate that cannot be read is left out, with a note.
+
+    Raises
+    ------
+    MarkerFileError
+        Damaged numbers and types of plates.
     """
     data = storage.read_bytes(path, "a C3D file")
     table = point_table(path, data)
     parameters = file_parameters(data, table.numbers)
-    used = int(sum(_own(parameters, "USED", 0, 1)))
-    kinds = _own(parameters, "TYPE", 0, max(used, 0)).astype(int).tolist()
+    try:
+        used = max(int(sum(_own(parameters, "USED", 0, 1))), 0)
+        kinds = [int(kind) for kind in _own(parameters, "TYPE", 0, used)]
+    except (ValueError, OverflowError) as problem:
+        raise MarkerFileError(f"{path}: FORCE_PLATFORM, USED and TYPE: expected whole numbers ({problem})") from None
     notes = [f"FORCE_PLATFORM names {used} plates, and the types of {len(kinds)}"] if len(kinds) < used else []
     plates: dict[int, _Plate] = {}
     for i, kind in enumerate(kinds):
         try:
             plates[i + 1] = _read_plate(path, data, parameters, i, kind, UNITS[unit or table.unit], ground[:, 1])
             notes += [f"force plate {i + 1}: {plates[i + 1].note}"] if plates[i + 1].note else []
-        except ValueError as problem:
+        except (ValueError, OverflowError) as problem:
             notes.append(f"force plate {i + 1} is left out: {str(problem).removeprefix(f'{path}: ')}")
     for note in notes:
         warnings.warn(f"{path.name}: {note}", stacklevel=2)
@@ -109,6 +118,8 @@ def _read_plate(path: Path, data: bytes, parameters: Parameters, i: int, kind: i
     if len(channels) < CHANNELS[kind]:
         raise ValueError(f"expected {CHANNELS[kind]} channels, found {len(channels)}")
     signals = read_analog(path, data, channels.tolist())
+    if not np.isfinite(signals).all():
+        raise ValueError("its channels hold values that are no numbers")
     # the zero level is the mean over the frames from ZERO, which count as the frames of the recording do
     low, high = (int(value) for value in [*_own(parameters, "ZERO", 0, 2), 0, 0][:2])
     samples, first = len(signals) // point_table(path, data).frames, first_frame(data, parameters)

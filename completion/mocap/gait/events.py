@@ -2,6 +2,7 @@
 from __future__ import annotations
 
 import re
+import warnings
 from collections.abc import Iterable
 from dataclasses import dataclass
 from itertools import pairwise
@@ -65,7 +66,11 @@ def find_gait_events(motion: Motion, subject: Subject, centres: np.ndarray, angl
     its toes are farthest behind (Zeni et al. 2008). Only events that follow each other as in a walk are kept.
     """
     if path is not None and path.suffix.lower() == ".c3d":
-        events = [event for event in read_file_events(path, motion.rate, who) if 0 <= event[0] <= motion.times[-1]]
+        try:
+            events = [event for event in read_file_events(path, motion.rate, who) if 0 <= event[0] <= motion.times[-1]]
+        except (ValueError, OverflowError) as problem:
+            warnings.warn(f"{path.name}: its events cannot be read: {problem}", stacklevel=2)
+            events = []
         strikes = [(time, side) for time, side, kind in events if kind == "strike"]
         cycles = _find_cycles(strikes)
         if any(map(len, cycles.values())):

@@ -2,6 +2,7 @@
 from __future__ import annotations
 
 import time
+import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
@@ -290,7 +291,10 @@ def write_walk(folder: Path, take: Take, angles: JointAngles) -> Walk:
         write_gait(folder, gait)
     reactions = None
     if path.suffix.lower() == ".c3d":
-        reactions = read_ground_reactions(path, angles.ground, motion.rate, take.unit)
+        try:
+            reactions = read_ground_reactions(path, angles.ground, motion.rate, take.unit)
+        except ValueError as problem:
+            warnings.warn(f"grf.mot is not written: {problem}", stacklevel=2)
     if reactions is not None:
         write_ground_reactions(folder / "grf.mot", reactions)
     return Walk(gait, reactions)
