@@ -96,12 +96,16 @@ def test_ezc3d_finds_the_same(tmp_path, kind):
     for name, value in (("CORNERS", CORNERS.T[..., None]), ("ORIGIN", np.array(ORIGINS[kind])[:, None]),
                         ("CAL_MATRIX", CROSS_TALK[..., None])):
         tree.add_parameter("FORCE_PLATFORM", name, value)
+    if kind == 3:                        # the maker's correction of the centre of pressure, here up to 8 mm
+        powers = np.array([[1e-16, 1e-12, 1e-8, 1e-13, 1e-8, 0.02], [1e-16, -1e-12, 2e-8, 1e-13, 1e-8, -0.05]])
+        tree.add_parameter("FORCE_PLATFORM", "FPCOPPOLY", powers.T[..., None])
     path = tmp_path / "a.c3d"
     tree.write(str(path))
     theirs, (found, _) = ezc3d.c3d(str(path), extract_forceplat_data=True)["data"]["platform"][0], read(path)
     np.testing.assert_allclose(found.forces[:, 0], theirs["force"].T @ GROUND, atol=1e-3)
     np.testing.assert_allclose(found.points[:, 0], theirs["center_of_pressure"].T @ GROUND / 1000, atol=1e-6)
-    np.testing.assert_allclose(found.moments[:, 0], theirs["Tz"].T @ GROUND / 1000, atol=1e-4)
+    np.testing.assert_allclose(found.moments[:, 0, 1], theirs["Tz"][2] / 1000, atol=1e-4)       # ours are vertical
+    assert np.allclose(found.points[0, 0], POINT / 1000 @ GROUND, atol=1e-3) == (kind != 3)
 
 
 @pytest.mark.parametrize("origin", [np.array([[3.0, -2, -30]]), np.array([[-3.0, 2, 30]])])
@@ -163,6 +167,7 @@ BAD = {"nan": (plate(corners=CORNERS * np.nan), "no rectangle"), "zero": (plate(
        "no origin": (plate(ORIGIN=np.zeros((1, 2))), "expected an origin of 3 numbers"),
        "type": (plate(kind=7), "expected a type of 1, 2, 3, 4, found 7"),
        "no matrix": (plate(kind=4, CAL_MATRIX=np.zeros(3)), "needs CAL_MATRIX"),
+       "no numbers": ([*plate(), ("ANALOG", "SCALE", np.full(6, np.nan))], "hold values that are no numbers"),
        "no types": (plate(TYPE=np.zeros(0, int)), "names 1 plates, and the types of 0")}
 
 
@@ -171,6 +176,14 @@ def test_a_bad_plate_is_a_sentence(tmp_path, name):
     more, words = BAD[name]
     found, notes = read(write(tmp_path / "a.c3d", steady(2), more))
     assert found is None and len(notes) == 1 and words in notes[0] and notes[0].startswith("a.c3d: ")
+
+
+def test_numbers_of_plates_that_are_none_are_an_error(tmp_path):
+    for name, more in (("TYPE", plate(TYPE=["II"])), ("USED", plate(USED=np.array([np.nan])))):
+        with pytest.raises(MarkerFileError, match="FORCE_PLATFORM, USED and TYPE: expected whole numbers"):
+            read(write(tmp_path / f"{name}.c3d", steady(2), more))
+    with pytest.raises(MarkerFileError, match=r"expected a unit of .*, found 'furlong'"):
+        read(write(tmp_path / "unit.c3d", steady(2), [*plate(), ("POINT", "UNITS", ["furlong"])]))
 
 
 def test_a_bad_plate_leaves_the_good_one_its_number(tmp_path):

@@ -233,6 +233,16 @@ def test_the_folder_and_the_page_of_a_take(tmp_path):
     page = Page("a stand")
     _show_walk(page, walk)
     assert "Gait" not in page.html() and "Force plate 1 is left out: its corners are no rectangle" in page.html()
+    # damaged parameters cost the files that need them, and no others
+    parameters = [("EVENT", "LABELS", ["LHS"]), ("EVENT", "TIMES", np.array([[0, 0.1]])),
+                  ("TRIAL", "ACTUAL_START_FIELD", np.array([np.nan, np.nan])), *plate(TYPE=["II"])]
+    path.write_bytes(c3d_bytes(np.ones((10, 1, 3)), ["C7"], rate=RATE, analog=analog, more=parameters))
+    (tmp_path / "damaged").mkdir()
+    with pytest.warns(UserWarning) as caught:
+        walk = write_walk(tmp_path / "damaged", take, standing[2])
+    assert walk.gait is None and walk.reactions is None and not list((tmp_path / "damaged").iterdir())
+    texts = " ".join(str(note.message) for note in caught)
+    assert "its events cannot be read" in texts and "grf.mot is not written" in texts
     empty = Page("nothing")
     _show_walk(empty, Walk(None, None))
     assert empty.html() == Page("nothing").html()

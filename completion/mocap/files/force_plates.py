@@ -69,7 +69,9 @@ def read_ground_reactions(path: Path, ground: np.ndarray, rate: float, unit: str
     """
     data = storage.read_bytes(path, "a C3D file")
     table = point_table(path, data)
-    parameters = file_parameters(data, table.numbers)
+    parameters, own_unit = file_parameters(data, table.numbers), unit or table.unit
+    if own_unit not in UNITS:
+        raise MarkerFileError(f"{path}: expected a unit of {', '.join(UNITS)}, found '{own_unit}'")
     try:
         used = max(int(sum(_own(parameters, "USED", 0, 1))), 0)
         kinds = [int(kind) for kind in _own(parameters, "TYPE", 0, used)]
@@ -79,7 +81,7 @@ def read_ground_reactions(path: Path, ground: np.ndarray, rate: float, unit: str
     plates: dict[int, _Plate] = {}
     for i, kind in enumerate(kinds):
         try:
-            plates[i + 1] = _read_plate(path, data, parameters, i, kind, UNITS[unit or table.unit], ground[:, 1])
+            plates[i + 1] = _read_plate(path, data, parameters, i, kind, UNITS[own_unit], ground[:, 1])
             notes += [f"force plate {i + 1}: {plates[i + 1].note}"] if plates[i + 1].note else []
         except (ValueError, OverflowError) as problem:
             notes.append(f"force plate {i + 1} is left out: {str(problem).removeprefix(f'{path}: ')}")
