@@ -108,6 +108,11 @@ def test_ezc3d_finds_the_same(tmp_path, kind):
     assert np.allclose(found.points[0, 0], POINT / 1000 @ GROUND, atol=1e-3) == (kind != 3)
 
 
+def test_a_matrix_may_be_stored_by_rows(tmp_path):
+    more = [*plate(4, CAL_MATRIX=CROSS_TALK[None]), ("FORCE_PLATFORM", "MATRIX_STORE", ["BYROW"])]
+    check(read(write(tmp_path / "a.c3d", steady(4), more))[0])
+
+
 @pytest.mark.parametrize("origin", [np.array([[3.0, -2, -30]]), np.array([[-3.0, 2, 30]])])
 def test_an_origin_is_read_in_both_directions(tmp_path, origin):
     check(read(write(tmp_path / "a.c3d", steady(2), plate(ORIGIN=origin)))[0])
