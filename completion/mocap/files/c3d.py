@@ -9,7 +9,7 @@ import itertools
 import math
 import struct
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -23,7 +23,7 @@ from .text import MarkerFileError, RawMarkers, distinct_labels
 BLOCK = 512                          # bytes; the unit in which the format counts positions in a file
 _INTEL, _DEC, _MIPS = 84, 85, 86     # processor types, by the numbers of the format
 MOST_FRAMES = 65535                  # largest count in the header, which then means that many or more
-_Parameters = dict[tuple[str, str], list[Any]]                       # group and name -> values
+Parameters = dict[tuple[str, str], list[Any]]                       # group and name -> values
 
 
 class _DamagedError(Exception):
@@ -117,7 +117,43 @@ def read_c3d(path: Path, data: bytes) -> RawMarkers:
     return RawMarkers(positions, tuple(table.labels[i] for i in table.kept), table.rate, table.unit, table.notes)
 
 
-def file_parameters(data: bytes, numbers: _Numbers) -> _Parameters:
+def read_analog(path: Path, data: bytes, channels: Sequence[int]) -> np.ndarray:
+    """Read analog channels (S, C) of a C3D file in their own units, S samples at a multiple of the frame rate.
+
+    `channels` count from 0; MarkerFileError where the file has fewer.
+    """
+    table = point_table(path, data)
+    parameters, size = file_parameters(data, table.numbers), 4 if table.kind == "f4" else 2
+    used, width = sum(_whole(parameters, "ANALOG", "USED")), table.width // size - 4 * len(table.labels)
+    if not all(0 <= channel < used for channel in channels) or not width or width % used:
+        raise MarkerFileError(f"{path}: expected analog channels up to {max(channels, default=0) + 1}, found {used} "
+                              f"channels and {width} analog values a frame")
+    # only the bytes of these channels are decoded
+    rows = np.frombuffer(data, np.uint8, table.frames * table.width, table.start).reshape(table.frames, -1, size)
+    raw = rows[:, 4 * len(table.labels):].reshape(-1, used, size)[:, list(channels)]
+    unsigned = "".join(map(str, parameters.get(("ANALOG", "FORMAT"), ()))).upper() == "UNSIGNED"
+    values = table.numbers.floats(raw.tobytes()) if size == 4 else \
+        table.numbers.words(raw.tobytes(), "u2" if unsigned else "i2").astype(np.float64)
+    # value = (stored - OFFSET) * SCALE * GEN_SCALE
+    offset, scale = np.zeros(used), np.ones(used)
+    for name, numbers in (("OFFSET", offset), ("SCALE", scale)):
+        said = _lists(parameters, name, "ANALOG")[:used]
+        numbers[:len(said)] = [float(number) for number in said]
+    if unsigned:
+        offset %= 65536
+    general = float(next(iter(parameters.get(("ANALOG", "GEN_SCALE"), ())), 1.0))
+    return (values.reshape(-1, len(channels)) - offset[list(channels)]) * scale[list(channels)] * general
+
+
+def first_frame(data: bytes, parameters: Parameters) -> int:
+    """Return the number of the first frame of a file, from 1 for a recording that was not cut."""
+    start = parameters.get(("TRIAL", "ACTUAL_START_FIELD"), ())
+    if len(start) == 2:
+        return (int(start[0]) & 0xFFFF) + 65536 * (int(start[1]) & 0xFFFF)
+    return int(_Numbers(data[(data[0] - 1) * BLOCK + 3]).words(data[6:8], "u2")[0])
+
+
+def file_parameters(data: bytes, numbers: _Numbers) -> Parameters:
     """Read all parameters; groups go by number, since a group may come after its parameters."""
     groups: dict[int, str] = {}
     records: list[tuple[int, str, list[Any]]] = []
@@ -167,7 +203,7 @@ def parameter_records(data: bytes, numbers: _Numbers) -> Iterator[tuple[int, str
         place = link + step
 
 
-def _table(data: bytes, parameters: _Parameters, numbers: _Numbers) -> PointTable:
+def _table(data: bytes, parameters: Parameters, numbers: _Numbers) -> PointTable:
     """Find where the points are, from the header, the parameters and the size of the file."""
     start = (int(numbers.words(data[16:18], "u2")[0]) - 1) * BLOCK
     scale = float(numbers.floats(data[12:16])[0])
@@ -198,7 +234,7 @@ def _table(data: bytes, parameters: _Parameters, numbers: _Numbers) -> PointTabl
                       unit_named(said) or said, (*notes, *twice))
 
 
-def _counts(data: bytes, parameters: _Parameters, numbers: _Numbers, scale: float, room: int
+def _counts(data: bytes, parameters: Parameters, numbers: _Numbers, scale: float, room: int
             ) -> tuple[int, int, int, int, tuple[str, ...]]:
     """Find the numbers of points, analog values and frames, the bytes of a number, and notes on a wrong header.
 
@@ -249,19 +285,19 @@ def _counts(data: bytes, parameters: _Parameters, numbers: _Numbers, scale: floa
     return count, analog, frames, size, tuple(notes)
 
 
-def rotations_start(parameters: _Parameters, start: int, size: int) -> int:
+def rotations_start(parameters: Parameters, start: int, size: int) -> int:
     """Return the byte of the rotations after the points, which begin at `start`; 0 where there are none."""
     place = BLOCK * (sum(_whole(parameters, "ROTATION", "DATA_START")) - 1)
     used = _whole(parameters, "ROTATION", "USED") or [len(parameters.get(("ROTATION", "LABELS"), ()))]
     return place if used[0] and start < place < size else 0
 
 
-def _whole(parameters: _Parameters, group: str, name: str) -> list[int]:
+def _whole(parameters: Parameters, group: str, name: str) -> list[int]:
     """Return the first value of a parameter as a count, in a list that is empty where it is missing."""
     return [int(value) & 0xFFFF for value in parameters.get((group, name), ())[:1] if isinstance(value, float | int)]
 
 
-def _frames(parameters: _Parameters, first: int, last: int, room: int) -> list[int]:
+def _frames(parameters: Parameters, first: int, last: int, room: int) -> list[int]:
     """Return possible numbers of frames, the likeliest first; beyond 65535 they are in parameters, not the header."""
     said = []
     ends = [parameters.get(("TRIAL", key), []) for key in ("ACTUAL_START_FIELD", "ACTUAL_END_FIELD")]
@@ -276,9 +312,9 @@ def _frames(parameters: _Parameters, first: int, last: int, room: int) -> list[i
     return [*said, max(room, counted)]
 
 
-def _lists(parameters: _Parameters, name: str) -> list[str]:
+def _lists(parameters: Parameters, name: str, group: str = "POINT") -> list[str]:
     """Read the texts of LABELS or DESCRIPTIONS; beyond 255 points they continue in LABELS2, LABELS3, ..."""
-    lists = (parameters.get(("POINT", f"{name}{part}" if part > 1 else name)) for part in itertools.count(1))
+    lists = (parameters.get((group, f"{name}{part}" if part > 1 else name)) for part in itertools.count(1))
     return [str(text) for some in itertools.takewhile(bool, lists) for text in some or ()]
 
 

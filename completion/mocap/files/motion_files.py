@@ -19,7 +19,7 @@ from scanprep.geometry.farthest_points import spread_indices
 from scanprep.pictures.camera import guess_upright
 
 from ...motion import Motion
-from ..joint_angles import NOTHING_KNOWN, Known
+from ..joint_angles import NOTHING_KNOWN, JointAngles, Known
 from .markers import MarkerSequence
 from .opensim import mask_unknown_centres, write_opensim
 
@@ -88,11 +88,11 @@ def joint_centres(motion: Motion, subject: Subject) -> np.ndarray:
 
 
 def write_motion_folder(folder: Path, motion: Motion, subject: Subject, markers: MarkerSequence | None = None,
-                        known: Known = NOTHING_KNOWN) -> None:
+                        known: Known = NOTHING_KNOWN) -> JointAngles | None:
     """Write motion.npz, .bvh, .trc and .mot, tables of joint angles and centres, and residuals.csv if there are any.
 
     `markers`, of as many frames, go into the TRC. What is `known` of the joint angles: values between parts that the
-    markers do not determine are empty cells.
+    markers do not determine are empty cells. Returned are the angles of the MOT.
     """
     skeleton, T, centres = subject.skeleton, len(motion.poses), joint_centres(motion, subject)
     names, angles = skeleton.names, joint_angles(motion)
@@ -104,9 +104,10 @@ def write_motion_folder(folder: Path, motion: Motion, subject: Subject, markers:
                   np.c_[motion.times, angles.reshape(T, -1)])
     write_numbers(folder / "joint_centres.csv", ["time", *(f"{name}_{axis}" for name in names for axis in "xyz")],
                   np.c_[motion.times, mask_unknown_centres(centres, skeleton, told).reshape(T, -1)])
-    write_opensim(folder, motion, subject, centres, markers, known)
+    anatomical = write_opensim(folder, motion, subject, centres, markers, known)
     if motion.labels:
         write_residuals(folder / "residuals.csv", motion)
+    return anatomical
 
 
 def write_residuals(path: Path, motion: Motion) -> None:

@@ -24,11 +24,13 @@ from .markers import MarkerSequence, write_markers
 
 
 def write_opensim(folder: Path, motion: Motion, subject: Subject, centres: np.ndarray,
-                  markers: MarkerSequence | None = None, known: Known = NOTHING_KNOWN) -> None:
+                  markers: MarkerSequence | None = None, known: Known = NOTHING_KNOWN) -> JointAngles | None:
     """Write motion.trc with markers, if any, and joint centres (T, J, 3), metres; joint angles for a person's body.
 
     Centres and angles between parts that the markers do not determine are empty cells, as far as that is `known`.
+    Returned are the angles.
     """
+    angles: JointAngles | None = None
     points = centre_sequence(mask_unknown_centres(centres, subject.skeleton, known.told), subject.skeleton, motion.rate)
     try:
         angles = anatomical_angles(motion, subject, centres, known)
@@ -49,6 +51,7 @@ def write_opensim(folder: Path, motion: Motion, subject: Subject, centres: np.nd
         labels, rate = (*markers.labels, *unlike(labels, markers.labels)), markers.rate
         positions = np.concatenate([markers.positions, positions], axis=1)
     write_markers(folder / "motion.trc", MarkerSequence(positions @ ground, labels, rate))
+    return angles
 
 
 def remove_distrusted(motion: Motion, markers: MarkerSequence) -> MarkerSequence:
@@ -104,13 +107,16 @@ def write_mot(path: str | Path, angles: JointAngles, rate: float) -> None:
                   angles.degrees[:, first:]]
     names = ("time", *angles.names[:first], "pelvis_tx", "pelvis_ty", "pelvis_tz", *angles.names[first:])
     axes = [f"{'-' if axis.sum() < 0 else '+'}{'xyz'[int(np.abs(axis).argmax())]}" for axis in angles.ground.T]
-    # the header of the format, with remarks
+    write_storage(path, names, table, [
+        "Angles are in degrees, pelvis_tx, pelvis_ty and pelvis_tz in metres.",
+        f"Axes x, y, z are {', '.join(axes)} of the recording.",
+        *([f"No parts for: {', '.join(angles.missing)}."] if angles.missing else []),
+        *([f"Seen by no marker, left out: {', '.join(angles.guessed)}."] if angles.guessed else [])])
+
+
+def write_storage(path: str | Path, names: Sequence[str], table: np.ndarray, remarks: Sequence[str]) -> None:
+    """Write columns (T, K) as a Storage file of OpenSim, with remarks in its header."""
     lines = [Path(path).stem, "version=1", f"nRows={len(table)}", f"nColumns={len(names)}", "inDegrees=yes", "",
-             "Angles are in degrees, pelvis_tx, pelvis_ty and pelvis_tz in metres.",
-             f"Axes x, y, z are {', '.join(axes)} of the recording.",
-             *([f"No parts for: {', '.join(angles.missing)}."] if angles.missing else []),
-             *([f"Seen by no marker, left out: {', '.join(angles.guessed)}."] if angles.guessed else []),
-             "", "endheader"]
-    lines += ["\t".join(names), *tables.number_lines(table, "%.8g", "\t")]
+             *remarks, "", "endheader", "\t".join(names), *tables.number_lines(table, "%.8g", "\t")]
     with storage.writing(Path(path)) as beside:
         beside.write_text("\n".join(lines) + "\n", encoding="utf-8", newline="\n")

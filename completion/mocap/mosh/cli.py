@@ -49,7 +49,9 @@ def mosh_markers(markers: MarkersArg, output: Output, model: Models = (), layout
     motion.bvh, anatomical_angles.csv (ISB joint angles, degrees, and their expected errors), joint_angles.csv (of the
     skeleton), joint_centres.csv, residuals.csv and residuals_soft.csv (metres), for OpenSim
     motion.trc and motion.mot (ISB joint angles), virtual.c3d (labels put right, gaps filled by the body, joint
-    centres), artefacts.json and artefacts.csv, report.html.
+    centres), artefacts.json and artefacts.csv, report.html. Of somebody who walks also gait_events.csv (foot strikes
+    and foot offs, those of the C3D file if it has them) and gait_cycles.csv (joint angles over the gait cycle). Of a
+    C3D file with force plates also grf.mot (forces for OpenSim).
 
     Files that are named are of one person. In a folder every sub-folder is a person; of files that lie side by side
     those are, whose names begin with the same number, as 85_02.c3d and 85_03.c3d, or else whose labels begin with the

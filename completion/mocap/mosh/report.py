@@ -21,11 +21,12 @@ from scanprep.pictures.shading import Dots
 from scanprep.pictures.sheets import webp_bytes
 
 from ...motion_pictures import MARKER, facing, marker_rows, mean_over, upwards, worst_frames
+from ..gait.pictures import chart_cycles, chart_forces
 from ..marker_sets.layout import MarkerLayout
 from . import pictures
 from .mosh import MoshResult
 from .pictures import chart_artefacts, chart_frames, chart_map, chart_timeline
-from .takes import Take
+from .takes import Take, Walk
 
 
 def person_page(name: str, model: BodyModel, result: MoshResult, usual: MarkerLayout, takes: Sequence[Take],
@@ -79,8 +80,8 @@ def person_page(name: str, model: BodyModel, result: MoshResult, usual: MarkerLa
     return closing(page, metrics, settings)
 
 
-def take_page(take: Take, metrics: Sequence[Metric], picture: np.ndarray) -> Page:
-    """Make the page of a sequence: motion, distances of markers, soft tissue, artefacts; `closing` ends it."""
+def take_page(take: Take, metrics: Sequence[Metric], picture: np.ndarray, walk: Walk) -> Page:
+    """Make the page of a sequence: motion, gait, distances of markers, soft tissue, artefacts; `closing` ends it."""
     motion, held, artefacts = take.motion, take.held, take.artefacts
     # 56 frames in which soft tissue is measured
     frames = spread_indices(len(take.shown.poses), 56)
@@ -91,6 +92,7 @@ def take_page(take: Take, metrics: Sequence[Metric], picture: np.ndarray) -> Pag
     page.section("The whole sequence").bodies(
         [pictures.take_pane(take)], "Press the triangle to play, drag the body to turn it; it is kept in the middle.",
         520, webp_bytes(picture))
+    _show_walk(page, walk)
     page.section("Distance of the markers", "From where the body has them to where they were measured.")
     page.chart(chart_frames(take), "mean of the markers, over time")
     page.chart(chart_map(take), "every marker over time, the worst first; white where it was not seen, or taken out "
@@ -134,6 +136,22 @@ def take_page(take: Take, metrics: Sequence[Metric], picture: np.ndarray) -> Pag
         page.picture(out.getvalue(), "these markers: how far they were from where the body has them, and what is left "
                      "of it")
     return page
+
+
+def _show_walk(page: Page, walk: Walk) -> None:
+    """Add joint angles over the gait cycle, and forces of the force plates, where there are any."""
+    if walk.gait is not None:
+        gait, sides = walk.gait, walk.gait.events.cycles
+        page.section("Gait", f"{len(sides['l'])} left and {len(sides['r'])} right gait cycles, "
+                     f"{gait.events.cadence:.0f} steps a minute. Foot strikes and foot offs are from: "
+                     f"{gait.events.source}. All angles are in gait_cycles.csv.")
+        page.chart(chart_cycles(gait), "joint angles from foot strike to the next strike of the same foot; the pelvis "
+                                       "is measured from the way of walking, once over left and once over right cycles")
+    if walk.reactions is not None:
+        page.section("Force plates", "Forces of the ground on the person, in grf.mot for OpenSim.")
+        page.chart(chart_forces(walk.reactions), "vertical force over time")
+        for note in walk.reactions.notes:
+            page.text(f"{note[0].upper()}{note[1:]}.")
 
 
 def closing(page: Page, metrics: Sequence[Metric], settings: Mapping[str, Any]) -> Page:

@@ -13,7 +13,9 @@ from model.linear import Subject
 from ...motion import Motion
 from ...motion_pictures import LightMesh
 from ..artefacts.results import MarkerArtefacts
+from ..files.force_plates import GroundReactions
 from ..files.markers import MarkerSequence
+from ..gait.cycles import GaitCycles
 from ..marker_sets.layout import MarkerLayout
 from ..pose.marked_body import supports
 from ..soft_tissue.soft_tissue import SoftTissue
@@ -32,6 +34,14 @@ class HeldOut:
     def shown(self) -> np.ndarray:
         """Distances (T, H) with soft tissue where there is one."""
         return self.fixed if self.soft is None else self.soft
+
+
+@dataclass(frozen=True, eq=False)
+class Walk:
+    """What a gait laboratory reads of a sequence: gait cycles of somebody who walks, forces of force plates."""
+
+    gait: GaitCycles | None
+    reactions: GroundReactions | None
 
 
 @dataclass(frozen=True, eq=False)

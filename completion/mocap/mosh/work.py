@@ -2,6 +2,7 @@
 from __future__ import annotations
 
 import time
+import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
@@ -28,10 +29,13 @@ from scanprep.pictures.sheets import save_png
 from ...motion_pictures import picture_bodies
 from ..angle_errors import expect_angle_errors
 from ..artefacts.results import artefact_table, write_virtual
+from ..files.force_plates import read_ground_reactions, write_ground_reactions
 from ..files.markers import MarkerSequence, read_markers
 from ..files.motion_files import joint_centres, write_glb, write_motion_folder, write_residuals
 from ..files.opensim import centre_sequence, mask_unknown_centres
-from ..joint_angles import Known, anatomical_angles, angle_doubts, find_static_zero
+from ..gait.cycles import average_cycles, write_gait
+from ..gait.events import find_gait_events
+from ..joint_angles import NOTHING_KNOWN, JointAngles, Known, anatomical_angles, angle_doubts, find_static_zero
 from ..labelling.labelled_file import label_first, show_labels
 from ..marker_sets.layout import MarkerLayout
 from ..marker_sets.named import choose_layout
@@ -44,7 +48,7 @@ from .mosh import MoshConfig, MoshResult, clocks, mosh, mosh_by_sex
 from .pictures import person_in_mean_pose
 from .recordings import Actor, Recording
 from .report import closing, person_page, person_picture, take_page, take_picture
-from .takes import LightMesh, Take, measure_held_out
+from .takes import LightMesh, Take, Walk, measure_held_out
 
 # held-out errors first; what is left after soft tissue was fitted to the same markers is small, and no error
 ERRORS = ("held-out error, fixed shape", "held-out error, soft tissue", "markers to the body, fixed shape",
@@ -150,6 +154,11 @@ class _Found:
         """Find in which frames the markers determine which parts, (T, J) bool."""
         return find_told_parts(take.subject, self.result.layout, take.motion)
 
+    def known(self, take: Take) -> Known:
+        """Find what is known of the joint angles of a sequence."""
+        errors = expect_angle_errors(take.motion, take.subject, self.result.layout, self.zero is not None)
+        return Known(self.told(take), errors, self.zero)
+
     def judgement(self, takes: Sequence[Take]) -> Judgement:
         """Judge the person and the motions of some sequences."""
         body, result, several = self.model.template, self.result, len(takes) > 1
@@ -251,7 +260,7 @@ def _write(work: MoshTask, found: _Found, take: Take, context: TaskContext, sett
     def page(folder: Path) -> None:
         start = time.perf_counter()
         picture = take_picture(take)
-        page = take_page(take, metrics, picture)
+        page = take_page(take, metrics, picture, walk)
         if shown:
             page.section("On a character", "The same rotations of the joints, and feet on the ground when those of the "
                          f"person are; soft tissue taken {factor:g} times.").picture(*shown)
@@ -263,33 +272,31 @@ def _write(work: MoshTask, found: _Found, take: Take, context: TaskContext, sett
         outcome = Outcome(place(folder), metrics, settings, judgement=judgement)
         write_report(outcome, work.command, time.perf_counter() - start)
 
-    determined = found.told(take)
-    metrics += untold_spans(take.subject.skeleton, determined, take.motion.rate)
-    metrics += context.files(f"{take.name} files",
-                             (solved, determined, take.source.path, take.source.who, take.unit, factor, found.zero),
-                             lambda folder: write_take(place(folder), take, found.result.layout, determined, factor,
-                                                       found.zero))
+    metrics += untold_spans(take.subject.skeleton, found.told(take), take.motion.rate)
+    exact, walk = context.files(f"{take.name} files", (solved, found.told(take), take.source.path, take.source.who,
+                                                       take.unit, factor, found.zero),
+                                lambda folder: write_take(place(folder), take, found.known(take), factor))
+    metrics += exact
     shown: list[Any] = []
     if (body := work.character) is not None:
-        *shown, exact = context.files(f"{take.name} character", (solved, body, factor),
+        *shown, errors = context.files(f"{take.name} character", (solved, body, factor),
                                       lambda folder: _character(body, take, place(folder), factor))
-        metrics += exact
+        metrics += errors
     start = clocks()
-    context.files(f"{take.name} page", (solved, metrics, settings, shown and (shown, factor)), page)
+    context.files(f"{take.name} page", (solved, metrics, settings, walk, shown and (shown, factor)), page)
     return metrics, clocks() - start
 
 
-def write_take(folder: Path, take: Take, layout: MarkerLayout, told: np.ndarray | None = None, factor: float = 1.0,
-               zero: Mapping[str, np.ndarray] | None = None) -> list[Metric]:
+def write_take(folder: Path, take: Take, known: Known = NOTHING_KNOWN, factor: float = 1.0
+               ) -> tuple[list[Metric], Walk]:
     """Write all files of a sequence but its page; exaggerated.glb only for a factor on soft tissue other than 1.
 
-    Angles and joint centres between parts that the markers do not determine (`told` (T, J) bool) are empty cells.
-    `zero` is that of the angles in a static trial.
-    Returned is the distance of the GLB files from the exact bodies.
+    Angles and joint centres between parts that the markers do not determine are empty cells, as far as that is `known`.
+    Returned are the distance of the GLB files from the exact bodies, and what a gait laboratory reads.
     """
     motion, body, soft = take.motion, take.subject, take.soft
-    errors = expect_angle_errors(motion, body, layout, zero is not None)
-    write_motion_folder(folder, motion, body, take.artefacts.virtual(), Known(told, errors, zero))
+    angles = write_motion_folder(folder, motion, body, take.artefacts.virtual(), known)
+    walk = Walk(None, None) if angles is None else write_walk(folder, take, angles)
     exact = write_glb(folder / "animation.glb", take.shown, body, None if soft is None else take.make)
     if soft is not None:
         soft.save(folder / "soft_tissue.npz")
@@ -301,8 +308,8 @@ def write_take(folder: Path, take: Take, layout: MarkerLayout, told: np.ndarray 
     path = take.source.path
     write_virtual(folder / "virtual.c3d", take.artefacts, path if path.suffix.lower() == ".c3d" else None,
                   take.source.who, take.unit,
-                  centre_sequence(mask_unknown_centres(joint_centres(motion, body), body.skeleton, told), body.skeleton,
-                                  motion.rate))
+                  centre_sequence(mask_unknown_centres(joint_centres(motion, body), body.skeleton, known.told),
+                                  body.skeleton, motion.rate))
     # artefacts as JSON, and the spans as a table
     storage.write_json(folder / "artefacts.json", artefact_table(take.artefacts))
     rows: list[tuple[str, str, int, int, str]] = [
@@ -310,7 +317,25 @@ def write_take(folder: Path, take: Take, layout: MarkerLayout, told: np.ndarray 
         *((b.kind, b.label, b.begin, b.end, f"{b.distance:.4g}") for b in take.artefacts.bad)]
     tables.write_table(folder / "artefacts.csv", ("artefact", "markers", "begin", "end", "distance"),
                        sorted(rows, key=lambda row: (row[2], row[1])))
-    return exact
+    return exact, walk
+
+
+def write_walk(folder: Path, take: Take, angles: JointAngles) -> Walk:
+    """Write gait cycles and events of somebody who walks, and grf.mot of a C3D file with force plates."""
+    path, motion = take.source.path, take.motion
+    events = find_gait_events(motion, take.subject, joint_centres(motion, take.subject), angles, path, take.source.who)
+    gait = None if events is None else average_cycles(angles, motion.rate, events)
+    if gait is not None:
+        write_gait(folder, gait)
+    reactions = None
+    if path.suffix.lower() == ".c3d":
+        try:
+            reactions = read_ground_reactions(path, angles.ground, motion.rate, take.unit)
+        except ValueError as problem:
+            warnings.warn(f"grf.mot is not written: {problem}", stacklevel=2)
+    if reactions is not None:
+        write_ground_reactions(folder / "grf.mot", reactions)
+    return Walk(gait, reactions)
 
 
 def _character(character: BodyModel, take: Take, folder: Path, factor: float) -> tuple[np.ndarray, str, list[Metric]]:
