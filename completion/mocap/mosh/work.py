@@ -154,7 +154,7 @@ class _Found:
         """Find in which frames the markers determine which parts, (T, J) bool."""
         return find_told_parts(take.subject, self.result.layout, take.motion)
 
-    def known(self, take: Take) -> Known:
+    def find_known(self, take: Take) -> Known:
         """Find what is known of the joint angles of a sequence."""
         errors = expect_angle_errors(take.motion, take.subject, self.result.layout, self.zero is not None)
         return Known(self.told(take), errors, self.zero)
@@ -275,7 +275,7 @@ def _write(work: MoshTask, found: _Found, take: Take, context: TaskContext, sett
     metrics += untold_spans(take.subject.skeleton, found.told(take), take.motion.rate)
     exact, walk = context.files(f"{take.name} files", (solved, found.told(take), take.source.path, take.source.who,
                                                        take.unit, factor, found.zero),
-                                lambda folder: write_take(place(folder), take, found.known(take), factor))
+                                lambda folder: write_take(place(folder), take, found.find_known(take), factor))
     metrics += exact
     shown: list[Any] = []
     if (body := work.character) is not None:
