@@ -33,7 +33,7 @@ def expect_angle_errors(motion: Motion, subject: Subject, layout: MarkerLayout, 
     layout : MarkerLayout
         Where the markers sit on this person.
     static : bool
-        The angles are zero in a static trial, so the zero of the body does not count.
+        The angles of joints are zero in a static trial, so the zero of the body does not count.
 
     Returns
     -------
@@ -71,7 +71,8 @@ def expect_angle_errors(motion: Motion, subject: Subject, layout: MarkerLayout, 
     rates = turn_angles(segments, subject, body, x)
     covariance = np.linalg.inv(information + 1e-6 * np.eye(x.shape[1]))
     error = TOGETHER * np.sqrt(np.einsum("tpk,tpq,tqk->tk", rates, covariance, rates, optimize=True))
-    error = np.hypot(np.degrees(error), np.hypot(OF_THE_BODY, 0.0 if static else OF_THE_ZERO))
+    zero = [0.0 if static and joint.proximal != "ground" else OF_THE_ZERO for joint in segments.joints()]
+    error = np.hypot(np.degrees(error), np.hypot(OF_THE_BODY, np.repeat(zero, 3)))
     every = np.arange(len(motion.poses))
     return np.stack([np.interp(every, frames, column) for column in error.T], axis=1)
 
