@@ -42,6 +42,7 @@ from ..marker_sets.named import choose_layout
 from ..pose.coverage import Coverage, find_coverage, find_told_parts, untold_spans
 from ..pose.follow import animate
 from ..pose.judgement import judge_motions, markers_told, motion_doubts, motion_problem
+from ..pose.witnesses import ask_witnesses, witness_doubts, witness_rows
 from ..retargeting.retarget import retarget
 from ..retargeting.soft_tissue import picture_transfer, retarget_soft_tissue, write_character
 from .mosh import MoshConfig, MoshResult, clocks, mosh, mosh_by_sex
@@ -154,6 +155,10 @@ class _Found:
         """Find in which frames the markers determine which parts, (T, J) bool."""
         return find_told_parts(take.subject, self.result.layout, take.motion)
 
+    def ask_witnesses(self, take: Take) -> dict[str, float]:
+        """Compute how far the unused markers of a sequence are from the body, metres."""
+        return ask_witnesses(take.motion, take.subject, take.markers, self.covered.used)
+
     def find_known(self, take: Take) -> Known:
         """Find what is known of the joint angles of a sequence."""
         errors = expect_angle_errors(take.motion, take.subject, self.result.layout, self.zero is not None)
@@ -167,7 +172,10 @@ class _Found:
             take.motion, take.subject.template, result.layout, take.markers))]
         angles = tuple((f"{take.name}: " if several else "") + why for take in takes
                        for why in angle_doubts(take.motion, take.subject, self.told(take)))
-        moving = Judgement.of(problems, motion_doubts(motions, [take.markers for take in takes], body) + angles)
+        witnesses = tuple((f"{take.name}: " if several else "") + why for take in takes
+                          for why in witness_doubts(self.ask_witnesses(take)))
+        moving = Judgement.of(problems, motion_doubts(motions, [take.markers for take in takes], body) + angles
+                              + witnesses)
         own = self.covered.judgement().merge(self.labelling, moving, result.misplaced.judgement(self.usual.labels),
                                              result.person.judgement(self.usual))
         return judge_motions(self.person, own, motions, body)
@@ -273,6 +281,7 @@ def _write(work: MoshTask, found: _Found, take: Take, context: TaskContext, sett
         write_report(outcome, work.command, time.perf_counter() - start)
 
     metrics += untold_spans(take.subject.skeleton, found.told(take), take.motion.rate)
+    metrics += witness_rows(found.ask_witnesses(take))
     exact, walk = context.files(f"{take.name} files", (solved, found.told(take), take.source.path, take.source.who,
                                                        take.unit, factor, found.zero),
                                 lambda folder: write_take(place(folder), take, found.find_known(take), factor))
