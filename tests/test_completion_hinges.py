@@ -38,6 +38,12 @@ def test_a_limb_that_turned_over_is_turned_back(part, upper, degrees, name):
     assert np.linalg.norm(BODY.positions(mended) - targets, axis=2).max() < 0.005
     np.testing.assert_allclose(hinges.measure(mended, hinges.segments)[:, column], bend, atol=3)
     np.testing.assert_array_equal(mended[[0, 2]], right[[0, 2]])
+    assert hinges.turned == 1
+    # a limb with less than two markers of its own stays: either bend is a guess
+    own = np.isin(BODY.part_of_marker, [NAMES.index(one) for one in (part, upper)]) | np.isin(
+        BODY.part_of_marker, np.flatnonzero(MODEL.skeleton.parents == NAMES.index(part)))
+    few = np.where((own & (np.cumsum(own) > 1))[:, None], np.nan, targets)
+    np.testing.assert_array_equal(hinges.turn_back(x, few, CONFIG), x)
 
 
 def test_a_limb_stays_where_the_markers_say_so():

@@ -119,10 +119,11 @@ def follow_frames(body: MarkedBody, targets: np.ndarray, frames: np.ndarray, rat
 
 
 def follow_whole(body: MarkedBody, targets: np.ndarray, rate: float, config: AnimateConfig, report_progress: Progress,
-                 start: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+                 start: np.ndarray | None = None, mend: bool = True) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Solve all frames together; return unknowns (T, P), the order of labels (T, L) and which frames converged (T,).
 
-    The initialisation is `start` (T, P), or poses interpolated between key frames.
+    The initialisation is `start` (T, P), or poses interpolated between key frames. Limbs that turned over are turned
+    back, to `mend` them, unless the whole motion fits the markers better without.
     """
     T, stiffness = len(targets), config.inertia(rate, body.n_unknowns)
     x = between_keys(body, targets, rate, config) if start is None else start.copy()
@@ -136,7 +137,7 @@ def follow_whole(body: MarkedBody, targets: np.ndarray, rate: float, config: Ani
         order = label_order(body.positions(x), targets, rate, config.outlier)
         taken = np.take_along_axis(targets, order[..., None], axis=1)[inside]
         near = reinitialise_frames(body, x[inside].copy(), taken, config)         # a copy: x changes below
-        near = hinges.turn_back(near, taken, config)
+        near = hinges.turn_back(near, taken, config) if mend else near
         weights, _ = marker_weights(body.positions(near), taken, config.marker_sd, config.outlier)
 
         # one step of all frames together
@@ -144,7 +145,12 @@ def follow_whole(body: MarkedBody, targets: np.ndarray, rate: float, config: Ani
             body.smooth_step(near, stiffness, feet.system, taken, weights, feet.target_positions(x)[inside])
         moved[inside] = np.linalg.norm(body.positions(x[inside]) - body.positions(near), axis=2).max(axis=1)
         report_progress(round(T * (i + 1) / rounds), T)
-    return x, order, (~np.isnan(targets[..., 0])).any(axis=1) & (moved < STILL)
+    seen = (~np.isnan(targets[..., 0])).any(axis=1)
+    result = x, order, seen & (moved < STILL)
+    if not hinges.turned:
+        return result
+    unmended = follow_whole(body, targets, rate, config, report_progress, start, mend=False)
+    return min(result, unmended, key=lambda one: float(hinges.misfit(one[0][seen], targets[seen], config).mean()))
 
 
 def between_keys(body: MarkedBody, targets: np.ndarray, rate: float, config: AnimateConfig) -> np.ndarray:

@@ -16,14 +16,14 @@ from .marked_body import AnimateConfig, MarkedBody, distances_apart, marker_misf
 
 HINGES = {"knee_angle": ("thigh", "shank"), "elbow_flex": ("humerus", "forearm")}
 BACKWARDS = -20.0                    # degrees: no elbow and no knee of people bends so far the other way
-WORSE = 1.05                         # the limb that bends as people's may fit the markers so much worse
+LEAST = 2                            # markers on a limb and what hangs on it, without which it is anybody's guess
 
 
 class Hinges:
     """The elbows and knees of a body with markers; none where it is no person's."""
 
     def __init__(self, body: MarkedBody) -> None:
-        self.body, self.skeleton = body, body.body.skeleton
+        self.body, self.skeleton, self.turned = body, body.body.skeleton, 0      # frames that were turned back
 
     @cached_property
     def segments(self) -> SegmentAxes | None:
@@ -43,7 +43,10 @@ class Hinges:
         for side, (hinge, limb) in ((side, item) for side in "lr" for item in HINGES.items()):
             if f"{hinge}_{side}" not in names:
                 continue
-            frames = np.flatnonzero(bends[:, names.index(f"{hinge}_{side}")] < BACKWARDS)
+            parts = [self.segments.parts[f"{name}_{side}"] for name in limb]
+            own = np.isin(self.body.part_of_marker, [*parts, *np.flatnonzero(self.skeleton.parents == parts[1])])
+            seen = np.isfinite(targets[:, own, 0]).sum(axis=1) >= LEAST
+            frames = np.flatnonzero(seen & (bends[:, names.index(f"{hinge}_{side}")] < BACKWARDS))
             if not len(frames):
                 continue
             # half a turn about the two bones, then the markers of each frame by themselves
@@ -52,8 +55,9 @@ class Hinges:
             turned = self.body.solve(turned, targets[frames], weights, 20, 1e-4).x
             bend = self.measure(turned, self.segments)[:, names.index(f"{hinge}_{side}")]
             better = (bend > BACKWARDS) & (self.misfit(turned, targets[frames], config)
-                                           < WORSE * self.misfit(out[frames], targets[frames], config) + 1e-9)
+                                           <= self.misfit(out[frames], targets[frames], config) + 1e-9)
             out[frames[better]] = turned[better]
+            self.turned += int(better.sum())
         return out
 
     def measure(self, x: np.ndarray, segments: SegmentAxes) -> np.ndarray:

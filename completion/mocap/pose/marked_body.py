@@ -94,6 +94,7 @@ class MarkedBody:
     def __init__(self, subject: Subject, layout: MarkerLayout, prior_weight: float, prior_shrinkage: float) -> None:
         self.body = FixedBody(subject)
         self.count = len(layout.labels)
+        self.part_of_marker = subject.skeleton.part_of_vertex(subject.template)[layout.nearest]
         self.n_unknowns = self.body.n_angles + 3
         ids, weights = supports(subject.template, layout)
         self.shapes = marker_shapes(subject, ids, weights, np.asarray(layout.distances))
