@@ -94,9 +94,9 @@ class MarkedBody:
     def __init__(self, subject: Subject, layout: MarkerLayout, prior_weight: float, prior_shrinkage: float) -> None:
         self.body = FixedBody(subject)
         self.count = len(layout.labels)
-        self.part_of_marker = subject.skeleton.part_of_vertex(subject.template)[layout.nearest]
         self.n_unknowns = self.body.n_angles + 3
         ids, weights = supports(subject.template, layout)
+        self.part_of_marker = subject.skeleton.part_of_vertex(subject.template)[layout.nearest]
         self.shapes = marker_shapes(subject, ids, weights, np.asarray(layout.distances))
         self.prior = gaussian_prior(self.body.pose_mean, self.body.pose_covariance, prior_shrinkage)
         self._precision = prior_weight * self.prior.whitening.T @ self.prior.whitening
