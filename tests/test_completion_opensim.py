@@ -11,9 +11,9 @@ from completion.mocap.files.c3d_points import add_points
 from completion.mocap.files.markers import MarkerFileError, MarkerSequence, read_markers, write_markers
 from completion.mocap.files.motion_files import joint_centres, write_motion_folder
 from completion.mocap.files.opensim import centre_labels, unlike, write_mot
-from completion.mocap.joint_angles import JointAngles, anatomy, angles_of, decompose, ground_axes, wrap
+from completion.mocap.joint_angles import JointAngles, anatomy, angles_of, decompose, ground_axes
 from completion.motion import Motion
-from scanprep.geometry.rotations import exp, log
+from scanprep.geometry.rotations import exp, log, wrap_angle
 from scanprep.skeleton.tree import Skeleton
 from scanprep.synthetic.anatomy import LEG_ANGLE, LEG_LEAN, PARENTS, PARTS, BodyShape, RestFrames
 
@@ -166,7 +166,7 @@ def test_one_false_turn_shifts_nothing_that_follows():
     R = np.concatenate([posed("shin_right", exp(-angle * axes("thigh_r", 2))) for angle in turn])
     knee = angles(R)["knee_angle_r"]
     np.testing.assert_allclose(knee, [0] * 5 + [60, 150, -120, -30] + [0] * 6, atol=1e-6)
-    np.testing.assert_allclose(wrap(np.radians([-180, 180, 541, 0])), np.radians([180, 180, -179, 0]), atol=1e-9)
+    np.testing.assert_allclose(wrap_angle(np.radians([-180, 180, 541, 0])), np.radians([180, 180, -179, 0]), atol=1e-9)
 
 
 def test_somebody_who_turns_round_goes_on_and_a_break_begins_anew():

@@ -4,6 +4,7 @@ from __future__ import annotations
 import numpy as np
 
 from model.linear import Subject
+from scanprep.geometry.rotations import wrap_angle
 from scanprep.threads import one_thread
 
 from ..motion import Motion
@@ -90,4 +91,4 @@ def turn_angles(segments: SegmentAxes, subject: Subject, body: MarkedBody, x: np
     here = angles(x)
     steps = step * np.eye(x.shape[1])[:, None].repeat(len(x), axis=1)
     apart = np.stack([angles(body.retract(x, one)) - here for one in steps], axis=1)
-    return (apart - 2 * np.pi * np.rint(apart / (2 * np.pi))) / step
+    return wrap_angle(apart) / step

@@ -74,12 +74,15 @@ class SegmentAxes:
         """Compute the axes (T, 3, 3) of every segment from part rotations (T, J, 3, 3) and joint centres (T, J, 3).
 
         The pelvis lies along the line of the hip centres and a limb's segment along that of its two joints, as the
-        rotations of parts answer to the skin around them; the turn about these lines is that of the part.
+        rotations of parts answer to the skin around them; the turn about these lines is that of the part. A hand, which
+        ends in no joint, goes with its forearm: its angles are those between the two parts.
         """
         axes = {name: R[:, part] @ self.frames[name] for name, part in self.parts.items()}
         for name, (near, far, column) in self.lines.items():
             line = centres[:, near] - centres[:, far]
-            axes[name] = _swing(axes[name], column, line / np.linalg.norm(line, axis=1, keepdims=True))
+            turn = _swing(axes[name][:, :, column], line / np.linalg.norm(line, axis=1, keepdims=True))
+            for moved in {name, name.replace("forearm", "hand")} & axes.keys():
+                axes[moved] = turn @ axes[moved]
         return axes
 
     def joints(self) -> list[Joint]:
@@ -253,9 +256,7 @@ def find_static_zero(motion: Motion, subject: Subject) -> dict[str, np.ndarray]:
     zero = {}
     for joint in segments.joints():
         if joint.proximal != "ground":
-            mean = (axes[joint.proximal].swapaxes(1, 2) @ axes[joint.distal]).mean(axis=0)
-            u, _, v = np.linalg.svd(mean)
-            zero[joint.angles[0]] = u @ np.diag([1, 1, np.linalg.det(u @ v)]) @ v
+            zero[joint.angles[0]] = rotations.mean(axes[joint.proximal].swapaxes(1, 2) @ axes[joint.distal])
     return zero
 
 
@@ -327,7 +328,8 @@ def angles_of(found: SegmentAxes, ground: np.ndarray, axes: Mapping[str, np.ndar
             relative = _MIRROR @ relative @ _MIRROR
         turns = np.array(joint.signs) * decompose(relative, joint.sequence, joint.distal.startswith("humerus"))
         centre = np.radians([_CENTRE.get(name[:-2], 0) for name in joint.angles])
-        columns.append(unwrap_whole(turns, relative) if joint.proximal == "ground" else wrap(turns, centre))
+        whole = joint.proximal == "ground"
+        columns.append(unwrap_whole(turns, relative) if whole else rotations.wrap_angle(turns, centre))
     return np.degrees(np.concatenate(columns, axis=1))
 
 
@@ -372,11 +374,6 @@ def decompose(R: np.ndarray, sequence: str, beyond: bool = False) -> np.ndarray:
     return _smaller(angles) if beyond and sequence == "zxy" else angles
 
 
-def wrap(angles: np.ndarray, centre: np.ndarray | float = 0.0) -> np.ndarray:
-    """Bring angles, radians, within half a turn of `centre`, as no joint of people has more."""
-    return centre + np.pi - (np.pi - (angles - centre)) % (2 * np.pi)
-
-
 def unwrap_whole(angles: np.ndarray, R: np.ndarray) -> np.ndarray:
     """Let angles (T, 3), radians, of a body that turns round go on beyond half a turn, while R (T, 3, 3) is continuous.
 
@@ -384,13 +381,12 @@ def unwrap_whole(angles: np.ndarray, R: np.ndarray) -> np.ndarray:
     """
     turned = rotations.log(R[1:] @ R[:-1].swapaxes(1, 2))
     breaks = np.flatnonzero(np.linalg.norm(turned, axis=1) > 2 * np.pi / 3) + 1
-    return np.concatenate([np.unwrap(some, axis=0) for some in np.split(wrap(angles), breaks)])
+    return np.concatenate([np.unwrap(some, axis=0) for some in np.split(rotations.wrap_angle(angles), breaks)])
 
 
 def _smaller(angles: np.ndarray) -> np.ndarray:
     """Choose between the two solutions of each frame: small angles (T, 3), radians, and small jumps (Viterbi)."""
-    both = np.stack([angles, angles * [1, -1, 1] + np.pi])               # (2, T, 3)
-    both -= 2 * np.pi * np.rint(both / (2 * np.pi))
+    both = rotations.wrap_angle(np.stack([angles, angles * [1, -1, 1] + np.pi]))             # (2, T, 3)
     # 0.05: cost of large angles, small against that of a jump
     size = 0.05 * np.abs(both).sum(axis=2)
     jump = np.abs(np.exp(1j * both[:, None, 1:]) - np.exp(1j * both[None, :, :-1])).sum(axis=3)      # (2, 2, T - 1)
@@ -407,12 +403,12 @@ def _smaller(angles: np.ndarray) -> np.ndarray:
     return out
 
 
-def _swing(axes: np.ndarray, column: int, line: np.ndarray) -> np.ndarray:
-    """Turn axes (T, 3, 3) the shortest way so that a column lies along unit vectors (T, 3)."""
-    across = np.cross(axes[:, :, column], line)
-    sine, cosine = np.linalg.norm(across, axis=1), np.einsum("td,td->t", axes[:, :, column], line)
+def _swing(column: np.ndarray, line: np.ndarray) -> np.ndarray:
+    """Compute the smallest rotations (T, 3, 3) that turn unit vectors (T, 3) to others (T, 3)."""
+    across = np.cross(column, line)
+    sine, cosine = np.linalg.norm(across, axis=1), np.einsum("td,td->t", column, line)
     angle = np.arctan2(sine, cosine) / np.maximum(sine, 1e-12)
-    return np.asarray(rotations.exp(angle[:, None] * across) @ axes)
+    return np.asarray(rotations.exp(angle[:, None] * across))
 
 
 def _turn(axis: int, angle: np.ndarray | float) -> np.ndarray:

@@ -102,7 +102,7 @@ def find_roll(angle: np.ndarray, bend: np.ndarray, tolerance: np.ndarray) -> tup
     if abs(constant) <= np.average(tolerance[bent], weights=weight):
         constant = 0.0
     # what remains, without jumps of whole turns
-    off = np.unwrap(wrap_angle(angle[bent] - constant))
+    off = np.unwrap(rotations.wrap_angle(angle[bent] - constant))
     off -= 2 * np.pi * np.rint(off.mean() / (2 * np.pi))
     if (np.abs(off) > tolerance[bent]).mean() < OFTEN:                    # a few: noise, or a knee bent backwards
         return constant, np.zeros(len(angle))
@@ -138,8 +138,8 @@ def roll_limbs(hinges: Sequence[Hinge], parents: np.ndarray, world: Mapping[int,
         for k, part in enumerate(hinge.parts[:2]):
             angle = hinge.angles(world[part], k)
             shared = _nearer(roll, angle[bent])
-            constant, changing = find_roll(wrap_angle(angle - shared), hinge.bend, hinge.tolerance(k))
-            roll = float(wrap_angle(shared + constant)) if bent.any() else -known.get((hinge.joint, k), 0.0)
+            constant, changing = find_roll(rotations.wrap_angle(angle - shared), hinge.bend, hinge.tolerance(k))
+            roll = float(rotations.wrap_angle(shared + constant)) if bent.any() else -known.get((hinge.joint, k), 0.0)
             known[hinge.joint, k] = roll
             turns[part] = rotations.exp(roll * hinge.bones[k])
             rolls[part] = Roll(roll, changing, hinge.bones[k])
@@ -158,22 +158,17 @@ def roll_limbs(hinges: Sequence[Hinge], parents: np.ndarray, world: Mapping[int,
 def axial(R: np.ndarray, bone: np.ndarray) -> np.ndarray:
     """Compute the twists (T,), radians, of rotations R (T, 3, 3) about a bone (3,), after the smallest swing."""
     q = Rotation.from_matrix(R).as_quat()
-    return wrap_angle(2 * np.arctan2(q[:, :3] @ bone, q[:, 3]))
+    return rotations.wrap_angle(2 * np.arctan2(q[:, :3] @ bone, q[:, 3]))
 
 
 def _nearer(roll: float, wanted: np.ndarray) -> float:
     """Return the roll if it is nearer to the wanted angles on average than none is, else 0."""
     mean = _mean_angle(wanted) if len(wanted) else 0.0
-    return roll if abs(wrap_angle(mean - roll)) < abs(mean) else 0.0
+    return roll if abs(rotations.wrap_angle(mean - roll)) < abs(mean) else 0.0
 
 
 def _mean_angle(angles: np.ndarray, weights: np.ndarray | float = 1.0) -> float:
     return float(np.angle((weights * np.exp(1j * angles)).sum()))
-
-
-def wrap_angle(angles: np.ndarray | float) -> np.ndarray:
-    """Bring angles, radians, into the half turn to both sides of 0."""
-    return np.asarray((angles + np.pi) % (2 * np.pi) - np.pi)
 
 
 def _unit(vectors: np.ndarray) -> np.ndarray:

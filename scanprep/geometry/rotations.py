@@ -108,6 +108,11 @@ def _cofactors(X: np.ndarray) -> np.ndarray:
     return C
 
 
+def wrap_angle(angles: np.ndarray | float, centre: np.ndarray | float = 0.0) -> np.ndarray:
+    """Bring angles, radians, into the half turn to both sides of `centre`: above centre - π, at most centre + π."""
+    return np.asarray(centre + np.pi - (np.pi - (angles - centre)) % (2 * np.pi))
+
+
 def mean(R: np.ndarray) -> np.ndarray:
     """Compute the chordal mean (3, 3) of rotations (n, 3, 3)."""
     return project(np.mean(R, axis=0)[None])[0]

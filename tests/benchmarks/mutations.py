@@ -480,7 +480,7 @@ MUTATIONS = (
          '-np.pi / 2 if side == "r" else np.pi / 2'),
         ("angles of the inverse", "proximal.swapaxes(1, 2) @ axes[joint.distal]", "proximal @ axes[joint.distal]"),
         ("a break goes on", "> 2 * np.pi / 3) + 1", "> 20 * np.pi / 3) + 1"),
-        ("limbs along their parts only", "axes[name] = _swing(", "_swing("),
+        ("limbs along their parts only", "axes[moved] = turn @ axes[moved]", "turn @ axes[moved]"),
         ("radians for degrees", "np.degrees(np.concatenate(columns", "np.asarray(np.concatenate(columns")),
     *of("completion/mocap/retargeting/soft_tissue.py", "completion_mosh_characters",
         ("soles below the ground", "trans[:, up] += sign * (fixed", "trans[:, up] -= sign * (fixed"),

@@ -42,7 +42,7 @@ from ..marker_sets.named import choose_layout
 from ..pose.coverage import Coverage, find_coverage, find_told_parts, untold_spans
 from ..pose.follow import animate
 from ..pose.judgement import judge_motions, markers_told, motion_doubts, motion_problem
-from ..pose.witnesses import ask_witnesses, witness_doubts, witness_rows
+from ..pose.witnesses import ask_witnesses, witness_doubts
 from ..retargeting.retarget import retarget
 from ..retargeting.soft_tissue import picture_transfer, retarget_soft_tissue, write_character
 from .mosh import MoshConfig, MoshResult, clocks, mosh, mosh_by_sex
@@ -281,7 +281,9 @@ def _write(work: MoshTask, found: _Found, take: Take, context: TaskContext, sett
         write_report(outcome, work.command, time.perf_counter() - start)
 
     metrics += untold_spans(take.subject.skeleton, found.told(take), take.motion.rate)
-    metrics += witness_rows(found.ask_witnesses(take))
+    if witnesses := list(found.ask_witnesses(take).items())[:3]:
+        farthest = ", ".join(f"{label} {MM * off:.0f} mm" for label, off in witnesses)
+        metrics.append(Metric("markers not used, distance from the body, the farthest", farthest))
     exact, walk = context.files(f"{take.name} files", (solved, found.told(take), take.source.path, take.source.who,
                                                        take.unit, factor, found.zero),
                                 lambda folder: write_take(place(folder), take, found.find_known(take), factor))

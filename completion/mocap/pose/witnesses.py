@@ -6,7 +6,6 @@ from collections.abc import Collection
 import numpy as np
 
 from model.linear import Subject
-from scanprep.console import Metric
 from scanprep.geometry.farthest_points import spread_indices
 from scanprep.geometry.surface import Surface
 
@@ -48,9 +47,3 @@ def witness_doubts(witnesses: dict[str, float]) -> tuple[str, ...]:
     far = [f"{label} {1000 * off:.0f} mm" for label, off in witnesses.items() if off > FAR]
     return (f"{len(far)} markers that were not used lie off the body ({', '.join(far[:3])}): look at the limbs there",
             ) if len(far) >= SEVERAL else ()
-
-
-def witness_rows(witnesses: dict[str, float]) -> list[Metric]:
-    """Return the row of the unused markers that are farthest off, if any were seen."""
-    told = ", ".join(f"{label} {1000 * off:.0f} mm" for label, off in list(witnesses.items())[:3])
-    return [Metric("markers not used, distance from the body, the farthest", told)] if told else []
