@@ -8,7 +8,7 @@ from scanprep.geometry.rotations import wrap_angle
 from scanprep.threads import one_thread
 
 from ..motion import Motion
-from .joint_angles import SegmentAxes, anatomy, angles_of, ground_axes, rest_joints
+from .joint_angles import SegmentAxes, angles_of, ground_axes, person_segments
 from .marker_sets.layout import MarkerLayout
 from .pose.marked_body import MarkedBody
 
@@ -21,8 +21,8 @@ TOGETHER, OF_THE_BODY, OF_THE_ZERO = 1.0, 1.2, 6.5
 
 
 @one_thread()
-def expect_angle_errors(motion: Motion, subject: Subject, layout: MarkerLayout, static: bool = False
-                        ) -> np.ndarray | None:
+def expect_angle_errors(motion: Motion, subject: Subject, layout: MarkerLayout, static: bool = False,
+                        segments: SegmentAxes | None = None) -> np.ndarray | None:
     """Compute the expected error (T, K) of every joint angle of a person, degrees, root mean square; None of others.
 
     Parameters
@@ -35,6 +35,8 @@ def expect_angle_errors(motion: Motion, subject: Subject, layout: MarkerLayout, 
         Where the markers sit on this person.
     static : bool
         The angles of joints are zero in a static trial, so the zero of the body does not count.
+    segments : SegmentAxes, optional
+        By the convention of an `AngleConfig`; without it ISB.
 
     Returns
     -------
@@ -51,9 +53,8 @@ def expect_angle_errors(motion: Motion, subject: Subject, layout: MarkerLayout, 
     >>> expect_angle_errors(motion, model.subject(), layout).shape
     (4, 48)
     """
-    skeleton = subject.skeleton
     try:
-        segments = anatomy(skeleton.names, skeleton.parents, rest_joints(subject))
+        segments = segments or person_segments(subject)
     except ValueError:
         return None
     columns, known = layout.match_columns(motion.labels)

@@ -7,11 +7,12 @@ with its zero, its signs and substitutes for landmarks that a skeleton does not 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from itertools import product
 from typing import Any
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from model.linear import Subject
 from scanprep.geometry import rotations
@@ -19,8 +20,9 @@ from scanprep.skeleton.roles import above, find_numbered_roles
 
 from ..motion import Motion
 
-# names of the three angles without the side: (proximal segment, distal segment, sequence of axes, signs)
-_SIDED = {
+# names of the three angles, without the side: (proximal segment, distal segment, sequence of axes, signs)
+Definitions = Mapping[tuple[str, str, str], tuple[str, str, str, tuple[int, int, int]]]
+_SIDED: Definitions = {
     ("hip_flexion", "hip_adduction", "hip_rotation"): ("pelvis", "thigh", "zxy", (1, 1, 1)),
     ("knee_angle", "knee_adduction", "knee_rotation"): ("thigh", "shank", "zxy", (-1, 1, 1)),
     ("ankle_angle", "ankle_inversion", "ankle_rotation"): ("shank", "foot", "zxy", (1, 1, 1)),
@@ -28,9 +30,11 @@ _SIDED = {
     ("shoulder_plane", "shoulder_elevation", "shoulder_rotation"): ("trunk", "humerus", "yxy", (1, -1, 1)),
     ("elbow_flex", "elbow_adduction", "forearm_pronation"): ("humerus", "forearm", "zxy", (1, 1, 1)),
     ("wrist_flex", "wrist_dev", "wrist_rotation"): ("forearm", "hand", "zxy", (1, 1, 1))}
-_MIDDLE = {("pelvis_tilt", "pelvis_list", "pelvis_rotation"): ("ground", "pelvis", "zxy", (1, 1, 1)),
-           ("lumbar_extension", "lumbar_bending", "lumbar_rotation"): ("pelvis", "trunk", "zxy", (1, 1, 1)),
-           ("neck_extension", "neck_bending", "neck_rotation"): ("trunk", "head", "zxy", (1, 1, 1))}
+_MIDDLE: Definitions = {
+    ("pelvis_tilt", "pelvis_list", "pelvis_rotation"): ("ground", "pelvis", "zxy", (1, 1, 1)),
+    ("lumbar_extension", "lumbar_bending", "lumbar_rotation"): ("pelvis", "trunk", "zxy", (1, 1, 1)),
+    ("neck_extension", "neck_bending", "neck_rotation"): ("trunk", "head", "zxy", (1, 1, 1))}
+ISB: Definitions = {**_MIDDLE, **_SIDED}
 # segment: its proximal and distal joint
 _LIMBS = {"thigh": ("hip", "knee"), "shank": ("knee", "ankle"), "foot": ("ankle", None),
           "humerus": ("shoulder", "elbow"), "forearm": ("elbow", "wrist"), "hand": ("wrist", None)}
@@ -69,6 +73,8 @@ class SegmentAxes:
     frames: dict[str, np.ndarray]
     hips: tuple[int, ...]            # joints whose middle is the position of the pelvis
     lines: dict[str, tuple[int, int, int]]       # segments along two joints, towards the first, by axis 1 or 2
+    definitions: Definitions = field(default_factory=lambda: ISB)
+    turns: Mapping[str, np.ndarray] = field(default_factory=dict)        # axes (3, 3) of another convention in these
 
     def move(self, R: np.ndarray, centres: np.ndarray) -> dict[str, np.ndarray]:
         """Compute the axes (T, 3, 3) of every segment from part rotations (T, J, 3, 3) and joint centres (T, J, 3).
@@ -83,16 +89,18 @@ class SegmentAxes:
             turn = _swing(axes[name][:, :, column], line / np.linalg.norm(line, axis=1, keepdims=True))
             for moved in {name, name.replace("forearm", "hand")} & axes.keys():
                 axes[moved] = turn @ axes[moved]
-        return axes
+        return axes | {name: axes[name] @ turn for name, turn in self.turns.items()}
 
     def joints(self) -> list[Joint]:
         """Return the joints whose two segments exist."""
         known = {"ground", *self.parts}
-        possible = [Joint(names, *rest, False) for names, rest in _MIDDLE.items()]
+        whole = {distal for _, distal, *_ in _MIDDLE.values()}
+        possible = [Joint(names, *rest, False) for names, rest in self.definitions.items() if rest[1] in whole]
         possible += [Joint((f"{a}_{side}", f"{b}_{side}", f"{c}_{side}"),
                            proximal if proximal in ("pelvis", "trunk") else f"{proximal}_{side}", f"{distal}_{side}",
                            sequence, signs, side == "l")
-                     for side in "rl" for (a, b, c), (proximal, distal, sequence, signs) in _SIDED.items()]
+                     for side in "rl" for (a, b, c), (proximal, distal, sequence, signs) in self.definitions.items()
+                     if distal not in whole]
         return [joint for joint in possible if {joint.proximal, joint.distal} <= known]
 
     def missing(self) -> tuple[str, ...]:
@@ -115,6 +123,13 @@ class JointAngles:
     missing: tuple[str, ...]         # joints of people that this body does not have
     guessed: tuple[str, ...] = ()    # angles that the markers never determine, which are left out
     errors: np.ndarray | None = None         # (T, K) degrees, expected, root mean square, NaN as the angles
+    signs: tuple[int, int, int] = (1, 1, 1)  # of the three angles of the pelvis against those of OpenSim
+
+    @property
+    def turns(self) -> Rotation:
+        """Orientation (T) of the pelvis in the ground."""
+        k = self.names.index("pelvis_tilt")
+        return Rotation.from_euler("ZXY", self.degrees[:, k:k + 3] * self.signs, degrees=True)
 
     def columns(self, rate: float) -> dict[str, np.ndarray]:
         """Return the columns (T,) of a table by name: time in seconds, angles in degrees, and their errors, if any."""
@@ -146,6 +161,7 @@ class Known:
     told: np.ndarray | None = None           # (T, J) bool: parts that the markers determine
     errors: np.ndarray | None = None         # (T, K) degrees, of `expect_angle_errors`
     zero: Mapping[str, np.ndarray] | None = None         # of `find_static_zero`
+    segments: SegmentAxes | None = None      # by the convention of an `AngleConfig`, without it ISB
 
 
 NOTHING_KNOWN = Known()
@@ -223,8 +239,7 @@ def anatomical_angles(motion: Motion, subject: Subject, centres: np.ndarray, kno
     ValueError
         A body whose parts lack the names of a person's.
     """
-    skeleton = subject.skeleton
-    segments = anatomy(skeleton.names, skeleton.parents, rest_joints(subject))
+    skeleton, segments = subject.skeleton, known.segments or person_segments(subject)
     R = skeleton.part_rotations(motion.poses)
     ground = ground_axes(segments.axes, R[:, segments.parts["pelvis"]])
     degrees = angles_of(segments, ground, segments.move(R, centres), known.zero)
@@ -239,10 +254,11 @@ def anatomical_angles(motion: Motion, subject: Subject, centres: np.ndarray, kno
     some = np.isfinite(degrees).any(axis=0)
     determined, guessed = (tuple(np.array(names)[which].tolist()) for which in (some, ~some))
     errors = None if known.errors is None else np.where(np.isfinite(degrees), known.errors, np.nan)[:, some]
-    return JointAngles(determined, degrees[:, some], pelvis, ground, segments.missing(), guessed, errors)
+    signs = next(joint.signs for joint in joints if joint.distal == "pelvis")
+    return JointAngles(determined, degrees[:, some], pelvis, ground, segments.missing(), guessed, errors, signs)
 
 
-def find_static_zero(motion: Motion, subject: Subject) -> dict[str, np.ndarray]:
+def find_static_zero(motion: Motion, subject: Subject, segments: SegmentAxes | None = None) -> dict[str, np.ndarray]:
     """Find the zero of joint angles from a static trial: somebody who stands upright and still.
 
     Returns
@@ -250,9 +266,8 @@ def find_static_zero(motion: Motion, subject: Subject) -> dict[str, np.ndarray]:
     {str: (3, 3) float}
         By the first angle of each joint, how its segments are turned against each other on average.
     """
-    skeleton = subject.skeleton
-    segments = anatomy(skeleton.names, skeleton.parents, rest_joints(subject))
-    axes = segments.move(skeleton.part_rotations(motion.poses), subject.joints(motion.poses, motion.trans))
+    segments = segments or person_segments(subject)
+    axes = segments.move(subject.skeleton.part_rotations(motion.poses), subject.joints(motion.poses, motion.trans))
     zero = {}
     for joint in segments.joints():
         if joint.proximal != "ground":
@@ -269,7 +284,7 @@ def angle_doubts(motion: Motion, subject: Subject, told: np.ndarray) -> tuple[st
 
 
 def angle_table(motion: Motion, subject: Subject, known: Known = NOTHING_KNOWN) -> Any:
-    """Compute the ISB joint angles of a person in motion as a table of named columns.
+    """Compute the joint angles of a person in motion as a table of named columns.
 
     Parameters
     ----------
@@ -278,7 +293,7 @@ def angle_table(motion: Motion, subject: Subject, known: Known = NOTHING_KNOWN) 
     subject : Subject
         The body that moves, with the parts of a person.
     known : Known, optional
-        Parts that the markers determine, and errors; other angles are NaN, or left out where they always are.
+        Parts that the markers determine, errors, and segments of another convention than ISB; other angles are NaN, or left out where they always are.
 
     Returns
     -------
@@ -305,6 +320,11 @@ def angle_table(motion: Motion, subject: Subject, known: Known = NOTHING_KNOWN) 
     except ImportError:
         return columns
     return pandas.DataFrame(columns)
+
+
+def person_segments(subject: Subject) -> SegmentAxes:
+    """Find the segments of a person at rest, by ISB; ValueError for parts without the names of a person's."""
+    return anatomy(subject.skeleton.names, subject.skeleton.parents, rest_joints(subject))
 
 
 def rest_joints(subject: Subject) -> np.ndarray:
@@ -354,12 +374,14 @@ def _nearest_axis(direction: np.ndarray) -> np.ndarray:
 
 
 def decompose(R: np.ndarray, sequence: str, beyond: bool = False) -> np.ndarray:
-    """Decompose rotations R (T, 3, 3) into angles (T, 3), radians, about the axes of a sequence, "zxy" or "yxy".
+    """Decompose rotations R (T, 3, 3) into angles (T, 3), radians, about the axes of "zxy", "zyx" or "yxy".
 
     R = R_1(a) R_2(b) R_3(c). For "yxy", -b is between 0 and half a turn, as in ISB. For "zxy", b is within a quarter of
     a turn; `beyond` that, as an arm that is raised sideways goes, it continues without a jump where that is the smaller
     change. In gimbal lock, a stays as it was.
     """
+    if sequence == "zyx":                # with x and y exchanged and z reversed that is "zxy"
+        return decompose(R[:, [1, 0, 2]][:, :, [1, 0, 2]] * np.outer([1, 1, -1], [1, 1, -1]), "zxy") * [-1, 1, 1]
     if sequence == "zxy":
         lost = np.hypot(R[:, 0, 1], R[:, 1, 1])
         a, b = np.arctan2(-R[:, 0, 1], R[:, 1, 1]), np.arctan2(R[:, 2, 1], lost)

@@ -20,6 +20,7 @@ from scanprep.geometry.storage import read_json
 from scanprep.ranges import BETAS, Positive
 
 from ...cli import ModelOrNone, body_of, read_model
+from ..angle_conventions import AngleConfig
 from ..files.markers import READERS, resolve_marker_unit
 from ..marker_sets.named import layout_or_file
 from ..pose.follow import AnimateConfig
@@ -34,8 +35,8 @@ def animate_markers(markers: MarkersArg, output: Output, model: ModelOrNone = No
                     subject: str | None = None, unit: PersonUnit | None = None, rate: Positive | None = None,
                     subject_prefix: str | None = None, retarget_to: Path | None = None, betas_to: Path | None = None,
                     unlabelled: bool = False, config: AnimateConfig = AnimateConfig(),
-                    person: PersonConfig = PersonConfig(), workers: Workers = Workers(), *, space: Workspace
-                    ) -> Outcome:
+                    person: PersonConfig = PersonConfig(), angles: AngleConfig = AngleConfig(),
+                    workers: Workers = Workers(), *, space: Workspace) -> Outcome:
     """The motion of a person from markers, and the person; or a motion of another skeleton on a body.
 
     A folder is worked through file by file, each into a folder of its name; called again, it goes on where it was,
@@ -76,6 +77,7 @@ def animate_markers(markers: MarkersArg, output: Output, model: ModelOrNone = No
             worn.
         config: Settings.
         person: Settings of the person from markers.
+        angles: Settings of the joint angles.
         workers: Who works through the files of a folder.
     """
     found = list_files(markers, lambda path: path.suffix.lower() in READERS or motion_among(path),
@@ -100,8 +102,8 @@ def animate_markers(markers: MarkersArg, output: Output, model: ModelOrNone = No
                        None if retarget_to is None else read_subject(loaded, retarget_to, unit),
                        None if betas_to is None else read_betas_to(betas_to, loaded.n_betas), units, subject_prefix,
                        rate,
-                       config, person, unlabelled)
-    settings = {"animate": config, "person": person, "model": name}
+                       config, person, unlabelled, angles)
+    settings = {"animate": config, "person": person, "angles": angles, "model": name}
     if markers.is_file():
         return do_one("following the markers", space, work, Task("motion", markers), settings,
                       f"open {quote(str(output / 'report.html'))}; {quote(str(output / 'animation.glb'))} is for 3D "

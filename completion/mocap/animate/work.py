@@ -28,6 +28,7 @@ from ...motion_pictures import (
     pane_with_dots,
     worst_frames,
 )
+from ..angle_conventions import AngleConfig, define_segments, find_landmarks
 from ..angle_errors import expect_angle_errors
 from ..files.markers import MarkerSequence, read_markers
 from ..files.motion_files import write_glb, write_motion_folder
@@ -64,6 +65,7 @@ class AnimateTask:
     animate: AnimateConfig
     person: PersonConfig
     unlabelled: bool = False             # markers have no names
+    angles: AngleConfig = AngleConfig()
 
     def __call__(self, path: Path, context: TaskContext) -> list[Metric]:
         """Follow the markers of a file, or retarget its motion, and write everything into the folder of a task.
@@ -99,6 +101,7 @@ class AnimateTask:
         else:
             sequence = read_markers(path, self.unit, self.who, self.rate)
         layout, name = choose_layout(self.model, self.layout, sequence.labels)
+        find_landmarks(self.angles, self.model, layout)      # an error now, not after the fit
         metrics = [Metric("model", self.name), Metric("layout", name)]
         body, fit, misplaced, placed = self.subject, None, MisplacedMarkers(), Judgement()
         # the person, found from the markers
@@ -128,8 +131,10 @@ class AnimateTask:
             judgement = judge_motions(person_judgement(self.model, fit.betas), judgement, [motion], body.template)
         metrics = [judgement_row(judgement), *metrics, *covered.metrics(),
                    *untold_spans(body.skeleton, told, motion.rate), *motion_figures(motion)]
+        segments = define_segments(self.angles, self.model, body, layout)
+        errors = expect_angle_errors(motion, body, layout, segments=segments)
         write_motion_folder(output, motion, body, remove_distrusted(motion, sequence),
-                            Known(told, expect_angle_errors(motion, body, layout)))
+                            Known(told, errors, segments=segments))
         metrics += write_glb(output / "animation.glb", motion, body)
         page = motion_page(motion, body, sequence, path.name, metrics)
         if self.unlabelled:

@@ -85,9 +85,9 @@ def _from_the_way(angles: JointAngles, begin: float, end: float) -> np.ndarray:
     if not np.linalg.norm(way) > 0.2:
         way = face_ahead(angles)[cycle].mean(axis=0)
     turn = Rotation.from_euler("y", -np.arctan2(-way[2], way[0]))
-    pelvis = (turn * Rotation.from_euler("ZXY", angles.degrees[:, k:k + 3], degrees=True)).as_matrix()
+    pelvis = (turn * angles.turns).as_matrix()
     degrees = angles.degrees.copy()
-    degrees[:, k:k + 3] = np.degrees(decompose(pelvis, "zxy"))
+    degrees[:, k:k + 3] = np.degrees(decompose(pelvis, "zxy")) * angles.signs
     return degrees
 
 

@@ -11,7 +11,6 @@ from pathlib import Path
 import numpy as np
 from scipy.ndimage import gaussian_filter1d
 from scipy.signal import find_peaks
-from scipy.spatial.transform import Rotation
 
 from model.linear import Subject
 from scanprep.geometry import storage
@@ -138,15 +137,13 @@ def locate_feet(motion: Motion, subject: Subject, centres: np.ndarray, angles: J
 
 def face_ahead(angles: JointAngles) -> np.ndarray:
     """Return the horizontal direction (T, 3) in which the pelvis faces, in the axes of the ground."""
-    k = angles.names.index("pelvis_tilt")
-    facing = Rotation.from_euler("ZXY", angles.degrees[:, k:k + 3], degrees=True).as_matrix()[:, :, 0] * [1, 0, 1]
+    facing = angles.turns.as_matrix()[:, :, 0] * [1, 0, 1]
     return facing / np.maximum(np.linalg.norm(facing, axis=1, keepdims=True), 1e-9)
 
 
 def _goes_straight(angles: JointAngles, begin: float, end: float) -> bool:
     """Tell whether the pelvis turns less than `TURN` between two frames: no bend in the way, no jump, no dance."""
-    k, cycle = angles.names.index("pelvis_tilt"), slice(int(begin), int(np.ceil(end)) + 1)
-    pelvis = Rotation.from_euler("ZXY", angles.degrees[cycle, k:k + 3], degrees=True)
+    pelvis = angles.turns[int(begin):int(np.ceil(end)) + 1]
     return bool((pelvis * pelvis.mean().inv()).magnitude().max() < np.radians(TURN))
 
 

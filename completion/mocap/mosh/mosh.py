@@ -18,6 +18,7 @@ from scanprep.ranges import Settings
 from scanprep.threads import one_thread
 
 from ...motion import Motion, Progress
+from ..angle_conventions import AngleConfig, define_segments, find_landmarks
 from ..angle_errors import expect_angle_errors
 from ..artefacts.find import find_artefacts, no_artefacts, relabel_by_tracks
 from ..artefacts.results import ArtefactConfig, MarkerArtefacts
@@ -75,6 +76,8 @@ class MoshConfig(Settings):
         Let the skin move on the body.
     repair : bool
         Correct swapped labels, find misplaced markers, and leave out markers that slip, jitter or stray.
+    angles : AngleConfig
+        Convention of the joint angles.
     exaggeration : float
         Factor on soft tissue in exaggerated.glb and on a character; 0 leaves it out there.
 
@@ -90,6 +93,7 @@ class MoshConfig(Settings):
     poses: PoseConfig = field(default_factory=lambda: PoseConfig.from_weights(2.0, 0.3, 57600.0))
     soft: SoftTissueConfig = field(default_factory=SoftTissueConfig)
     artefacts: ArtefactConfig = field(default_factory=ArtefactConfig)
+    angles: AngleConfig = field(default_factory=AngleConfig)
     soft_tissue: bool = True
     repair: bool = True
     exaggeration: float = 1.0
@@ -130,6 +134,8 @@ class MoshResult:
         Markers that are not where the layout has them, and pairs with exchanged names.
     seconds : {str: (2,) float}
         Elapsed and processor time of each stage: "person", "poses", "artefacts", "soft tissue".
+    angles : AngleConfig
+        Convention of the joint angles.
 
     Examples
     --------
@@ -157,6 +163,7 @@ class MoshResult:
     artefacts: tuple[MarkerArtefacts, ...]
     misplaced: MisplacedMarkers = field(default_factory=MisplacedMarkers)
     seconds: dict[str, np.ndarray] = field(default_factory=dict)
+    angles: AngleConfig = field(default_factory=AngleConfig)
 
     @cached_property
     def subject(self) -> Subject:
@@ -164,10 +171,12 @@ class MoshResult:
         return self.model.subject(self.betas)
 
     def joint_angles(self, number: int = 0) -> Any:
-        """Return the ISB joint angles of a motion as `angle_table` does, with errors; NaN where no marker tells."""
+        """Return the joint angles of a motion as `angle_table` does, with errors; NaN where no marker tells."""
         motion = self.motions[number]
-        return angle_table(motion, self.subject, Known(find_told_parts(self.subject, self.layout, motion),
-                                                       expect_angle_errors(motion, self.subject, self.layout)))
+        segments = define_segments(self.angles, self.model, self.subject, self.layout)
+        errors = expect_angle_errors(motion, self.subject, self.layout, segments=segments)
+        return angle_table(motion, self.subject, Known(find_told_parts(self.subject, self.layout, motion), errors,
+                                                       segments=segments))
 
 
 @one_thread()
@@ -206,7 +215,7 @@ def mosh(recordings: MarkerSource | Sequence[MarkerSource], model: BodyModel | N
     ------
     ValueError
         A model without betas, no recording or one that cannot be read, fewer than 3 markers in common, no frame with 3
-        of them, a layout of another body.
+        of them, a layout of another body, a convention of joint angles without its landmarks.
 
     Examples
     --------
@@ -227,6 +236,7 @@ def mosh(recordings: MarkerSource | Sequence[MarkerSource], model: BodyModel | N
     config, sequences = config or MoshConfig(), read_recordings(recordings)
     model = load_default_model() if model is None else model
     layout = recognise_layout(model, layout, sequences)
+    find_landmarks(config.angles, model, layout)         # an error now, not after the fit
     trials = [_Trial(i, each, each) for i, each in enumerate(sequences)]
     stages = _Stages(model, config, step, progress, STEPS * (1 + len(trials) * (2 + config.soft_tissue)))
 
@@ -262,7 +272,7 @@ def mosh(recordings: MarkerSource | Sequence[MarkerSource], model: BodyModel | N
     every = [trial.result() for trial in trials]
     return MoshResult(model, person.fit.betas, person.fit.layout, person.fit, tuple(motion for motion, _, _ in every),
                       tuple(soft for _, soft, _ in every if soft is not None), tuple(found for *_, found in every),
-                      misplaced, stages.seconds)
+                      misplaced, stages.seconds, config.angles)
 
 
 @dataclass(eq=False)

@@ -27,6 +27,7 @@ from scanprep.pictures.camera import guess_upright
 from scanprep.pictures.sheets import save_png
 
 from ...motion_pictures import picture_bodies
+from ..angle_conventions import define_segments
 from ..angle_errors import expect_angle_errors
 from ..artefacts.results import artefact_table, write_virtual
 from ..files.force_plates import read_ground_reactions, write_ground_reactions
@@ -35,7 +36,15 @@ from ..files.motion_files import joint_centres, write_glb, write_motion_folder, 
 from ..files.opensim import centre_sequence, mask_unknown_centres
 from ..gait.cycles import average_cycles, write_gait
 from ..gait.events import find_gait_events
-from ..joint_angles import NOTHING_KNOWN, JointAngles, Known, anatomical_angles, angle_doubts, find_static_zero
+from ..joint_angles import (
+    NOTHING_KNOWN,
+    JointAngles,
+    Known,
+    SegmentAxes,
+    anatomical_angles,
+    angle_doubts,
+    find_static_zero,
+)
 from ..labelling.labelled_file import label_first, show_labels
 from ..marker_sets.layout import MarkerLayout
 from ..marker_sets.named import choose_layout
@@ -138,6 +147,7 @@ class _Found:
     usual: MarkerLayout
     layout_name: str
     labelling: Judgement                 # of labels that were found for unlabelled recordings, and of a static trial
+    segments: SegmentAxes | None         # by another convention than the usual ISB
     zero: Mapping[str, np.ndarray] | None        # of joint angles, from a static trial
 
     @cached_property
@@ -161,8 +171,9 @@ class _Found:
 
     def find_known(self, take: Take) -> Known:
         """Find what is known of the joint angles of a sequence."""
-        errors = expect_angle_errors(take.motion, take.subject, self.result.layout, self.zero is not None)
-        return Known(self.told(take), errors, self.zero)
+        errors = expect_angle_errors(take.motion, take.subject, self.result.layout, self.zero is not None,
+                                     self.segments)
+        return Known(self.told(take), errors, self.zero, self.segments)
 
     def judgement(self, takes: Sequence[Take]) -> Judgement:
         """Judge the person and the motions of some sequences."""
@@ -232,12 +243,14 @@ def _solve(work: MoshTask, actor: Actor, context: TaskContext) -> tuple[_Found, 
         held = measure_held_out(model, usual, work.hold_out, markers, result.motions[i], soft)
         takes.append(Take(source, unit, model, subject, markers, result.motions[i], soft, result.artefacts[i],
                           held, light))
-    zero, doubts = _stand(work, subject, result.layout) if work.static else (None, Judgement())
-    return _Found(model, guess, result, takes, usual, layout_name, Judgement().merge(*labelling, doubts),
+    segments = define_segments(work.config.angles, model, subject, result.layout)
+    zero, doubts = _stand(work, subject, result.layout, segments) if work.static else (None, Judgement())
+    return _Found(model, guess, result, takes, usual, layout_name, Judgement().merge(*labelling, doubts), segments,
                   zero), failures
 
 
-def _stand(work: MoshTask, subject: Subject, layout: MarkerLayout) -> tuple[dict[str, np.ndarray], Judgement]:
+def _stand(work: MoshTask, subject: Subject, layout: MarkerLayout, segments: SegmentAxes | None
+           ) -> tuple[dict[str, np.ndarray], Judgement]:
     """Find the zero of joint angles in the static trial of a person; judge whether it is one, and of that person."""
     assert work.static is not None, "the command asks for one"
     markers = read_markers(work.static, work.unit, None, work.rate)
@@ -252,7 +265,7 @@ def _stand(work: MoshTask, subject: Subject, layout: MarkerLayout) -> tuple[dict
         if name[:-2] in STANDING and abs(float(np.median(degrees))) > STANDING[name[:-2]]:
             doubts.append(f"{name} is {np.median(degrees):.0f} degrees in the static trial {work.static.name}, which "
                           "counts as 0: expected somebody who stands upright")
-    return find_static_zero(motion, subject), Judgement.of(check=doubts[:3])
+    return find_static_zero(motion, subject, segments), Judgement.of(check=doubts[:3])
 
 
 def _write(work: MoshTask, found: _Found, take: Take, context: TaskContext, settings: Mapping[str, Any]
@@ -285,7 +298,7 @@ def _write(work: MoshTask, found: _Found, take: Take, context: TaskContext, sett
         farthest = ", ".join(f"{label} {MM * off:.0f} mm" for label, off in witnesses)
         metrics.append(Metric("markers not used, distance from the body, the farthest", farthest))
     exact, walk = context.files(f"{take.name} files", (solved, found.told(take), take.source.path, take.source.who,
-                                                       take.unit, factor, found.zero),
+                                                       take.unit, factor, found.zero, work.config.angles),
                                 lambda folder: write_take(place(folder), take, found.find_known(take), factor))
     metrics += exact
     shown: list[Any] = []
