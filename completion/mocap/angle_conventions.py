@@ -89,8 +89,13 @@ def define_segments(config: AngleConfig, model: BodyModel, subject: Subject, lay
     if landmarks is None:
         return None
     rest = rest_joints(subject)
-    segments, at_rest = person_segments(subject), subject.vertices(np.zeros_like(rest))
-    at = dict(zip(landmarks.labels, landmarks.place(subject.template.with_vertices(at_rest)), strict=True))
+    places = landmarks.place(subject.template.with_vertices(subject.vertices(np.zeros_like(rest))))
+    return turn_segments(config, person_segments(subject), rest, dict(zip(landmarks.labels, places, strict=True)))
+
+
+def turn_segments(config: AngleConfig, segments: SegmentAxes, rest: np.ndarray, at: Mapping[str, np.ndarray]
+                  ) -> SegmentAxes:
+    """Give ISB segments the axes of a convention, from joints (J, 3) and landmarks `at` (3,) at rest, metres."""
     axes = {"pelvis": pelvis_axes(at)}
     if config.convention == "plug-in-gait":
         # a foot points from heel to toe, its z as level as it is at rest

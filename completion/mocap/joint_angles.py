@@ -293,7 +293,8 @@ def angle_table(motion: Motion, subject: Subject, known: Known = NOTHING_KNOWN) 
     subject : Subject
         The body that moves, with the parts of a person.
     known : Known, optional
-        Parts that the markers determine, errors, and segments of another convention than ISB; other angles are NaN, or left out where they always are.
+        Parts that the markers determine, errors, and segments of another convention than ISB. Other angles are NaN, or
+        left out where they always are.
 
     Returns
     -------

@@ -53,7 +53,7 @@ def animate_markers(markers: MarkersArg, output: Output, model: ModelOrNone = No
 
     Written are motion.npz (poses, trans, betas, rate), animation.glb, motion.bvh, joint_angles.csv (rotation vectors
     of every part against its parent, in degrees), joint_centres.csv (metres), residuals.csv, for OpenSim motion.trc
-    (markers, joint centres) and motion.mot (ISB joint angles), and report.html; of a subject that was found also
+    (markers, joint centres) and motion.mot (joint angles), and report.html; of a subject that was found also
     subject.json and layout.json, with loose markers where they are on this person.
 
     Args:

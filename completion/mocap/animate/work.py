@@ -1,7 +1,7 @@
 """The work of `scape animate` on one file of markers or of a motion: the person, its motion, all files, the page."""
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 
@@ -65,7 +65,7 @@ class AnimateTask:
     animate: AnimateConfig
     person: PersonConfig
     unlabelled: bool = False             # markers have no names
-    angles: AngleConfig = AngleConfig()
+    angles: AngleConfig = field(default_factory=AngleConfig)
 
     def __call__(self, path: Path, context: TaskContext) -> list[Metric]:
         """Follow the markers of a file, or retarget its motion, and write everything into the folder of a task.

@@ -106,8 +106,8 @@ def write_mot(path: str | Path, angles: JointAngles, rate: float) -> None:
     The pelvis has the signs of OpenSim's models, whatever the convention of the angles.
     """
     first = 3 if "pelvis_tilt" in angles.names else 0               # angles of the pelvis come before its position
-    table = np.c_[np.arange(len(angles.degrees)) / rate, angles.degrees[:, :first] * angles.signs[:first], angles.pelvis,
-                  angles.degrees[:, first:]]
+    table = np.c_[np.arange(len(angles.degrees)) / rate, angles.degrees[:, :first] * angles.signs[:first],
+                  angles.pelvis, angles.degrees[:, first:]]
     names = ("time", *angles.names[:first], "pelvis_tx", "pelvis_ty", "pelvis_tz", *angles.names[first:])
     axes = [f"{'-' if axis.sum() < 0 else '+'}{'xyz'[int(np.abs(axis).argmax())]}" for axis in angles.ground.T]
     write_storage(path, names, table, [

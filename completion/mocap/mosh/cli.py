@@ -48,7 +48,7 @@ def mosh_markers(markers: MarkersArg, output: Output, model: Models = (), layout
     markers sat), report.html, and in it a folder for each sequence: motion.npz and soft_tissue.npz, animation.glb,
     motion.bvh, anatomical_angles.csv (joint angles, degrees, and their expected errors), joint_angles.csv (of the
     skeleton), joint_centres.csv, residuals.csv and residuals_soft.csv (metres), for OpenSim
-    motion.trc and motion.mot (ISB joint angles), virtual.c3d (labels put right, gaps filled by the body, joint
+    motion.trc and motion.mot (joint angles), virtual.c3d (labels put right, gaps filled by the body, joint
     centres), artefacts.json and artefacts.csv, report.html. Of somebody who walks also gait_events.csv (foot strikes
     and foot offs, those of the C3D file if it has them) and gait_cycles.csv (joint angles over the gait cycle). Of a
     C3D file with force plates also grf.mot (forces for OpenSim).
