@@ -98,8 +98,10 @@ def test_landmarks_are_markers_of_the_person_or_known_on_the_body(name):
 def test_a_model_without_landmarks_and_a_wrong_word_are_named():
     worm = worm_with_prior()
     layout = MarkerLayout(("LASI", "RASI", "X"), [1, 2, 3])
-    with pytest.raises(ValueError, match=r"layout with LASI, .* missing LPSI, RPSI\. .* the convention 'isb'"):
+    with pytest.raises(ValueError, match=r"'isb-asis' needs LASI, .* missing LPSI, RPSI\. .* use 'isb'"):
         define_segments(AngleConfig("isb-asis"), worm, worm.subject(), layout)
+    with pytest.raises(ValueError, match="missing LASI, RASI, LPSI, RPSI, LHEE"):
+        define_segments(PIG, worm, worm.subject(), MarkerLayout(("X",), [3]))
     assert define_segments(AngleConfig(), worm, worm.subject(), layout) is None
     with pytest.raises(ValueError, match="expected one of isb, isb-asis, plug-in-gait, got 'pig'"):
         AngleConfig("pig")

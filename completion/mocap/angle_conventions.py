@@ -58,22 +58,18 @@ def find_landmarks(config: AngleConfig, model: BodyModel, layout: MarkerLayout) 
     if config.convention == "isb":
         return None
     needed = _PELVIS if config.convention == "isb-asis" else (*_PELVIS, *_FEET)
-    names = {*layout.labels, *layout.aliases}
-    worn = {label: next((word for word in (label, f"{label}S") if word in names), None) for label in needed}
-    if any(word is None for word in worn.values()):
-        try:
-            usual = choose_layout(model, "plugingait39", ())[0]
-        except ValueError:
-            raise ValueError(
-                f"convention: expected a layout with {', '.join(needed)} for {config.convention!r}, or a body on which "
-                f"the set plugingait39 is known; missing {', '.join(k for k, v in worn.items() if v is None)}. Add "
-                "them to the layout, or use the convention 'isb'") from None
-    places = [usual.select([label]) if word is None else replace(layout.select([word]), labels=(label,), loose=(),
-                                                                 wands=()) for label, word in worn.items()]
-    out = places[0]
-    for place in places[1:]:
-        out = out.merge(place)
-    return out
+    worn = {label: word for label in needed for word in (label, f"{label}S")
+            if word in layout.labels or word in layout.aliases}
+    own = replace(layout.select([*worn.values()]), labels=tuple(worn), loose=(), wands=())
+    missing = [label for label in needed if label not in worn]
+    if not missing:
+        return own
+    try:
+        return own.merge(choose_layout(model, "plugingait39", ())[0].select(missing))
+    except ValueError:
+        raise ValueError(f"convention: {config.convention!r} needs {', '.join(needed)}: expected these markers in the "
+                         "layout, or a body on which the set plugingait39 is known; missing "
+                         f"{', '.join(missing)}. Add them to the layout, or use 'isb'") from None
 
 
 def define_segments(config: AngleConfig, model: BodyModel, subject: Subject, layout: MarkerLayout
