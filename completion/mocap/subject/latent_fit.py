@@ -18,6 +18,7 @@ from model.linear import combination_weights
 from model.priors import gaussian_prior
 from scanprep.geometry.least_squares import Arrow, Residual, levenberg_marquardt, normal_equations
 from scanprep.ranges import Count, Positive, Seed, Settings
+from scanprep.skeleton.roles import find_numbered_roles
 
 from ..marker_sets.layout import DISTANCE, MarkerLayout
 from ..marker_sets.symmetry import label_pairs
@@ -62,6 +63,9 @@ class PersonConfig(Settings):
         Weight of the shape prior; 1 is the distribution of people in the model.
     pose : float
         Weight of the pose prior.
+    flexion : float, degrees
+        How much further hips, knees and ankles bend than in the training poses, which are of people who stand and walk;
+        0 is the paper. A crouched person stood up otherwise, with markers moved along the skin instead.
     annealing : floats
         Factors on the last three weights, one stage each.
     outlier : float, metres
@@ -91,6 +95,7 @@ class PersonConfig(Settings):
     initial: float = 1.0
     shape: float = 1.0
     pose: float = 0.25
+    flexion: float = 60.0
     annealing: tuple[Positive, ...] = (40.0, 20.0, 10.0, 4.0, 2.0, 1.0)
     outlier: Positive = 0.06
     loose: bool = True
@@ -100,7 +105,8 @@ class PersonConfig(Settings):
     @classmethod
     def from_paper(cls) -> PersonConfig:
         """Return the weights of [MoSh], with twelve random frames, six stages and equal markers."""
-        return cls(choice="random", data=0.75, surface=100.0, initial=0.25, outlier=1000.0, loose=False, wand=0.0)
+        return cls(choice="random", data=0.75, surface=100.0, initial=0.25, flexion=0.0, outlier=1000.0, loose=False,
+                   wand=0.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -193,6 +199,21 @@ def shape_term(z: np.ndarray, n_betas: int, weight: float) -> Residual:
     return Residual(prior.values, J)
 
 
+def free_flexion(model: BodyModel, degrees: float) -> np.ndarray:
+    """Return the covariance (3J, 3J) of a model's poses, with that much more bending of hips, knees and ankles."""
+    covariance, joints = np.array(model.pose_covariance, dtype=np.float64), model.skeleton.joints
+    roles = find_numbered_roles(model.skeleton.names, joints)
+    if {"l_hip", "r_hip"} <= roles.keys():
+        # legs bend about the line through the hips
+        line = joints[roles["r_hip"]] - joints[roles["l_hip"]]
+        line = line / np.linalg.norm(line)
+        for role in ("l_hip", "r_hip", "l_knee", "r_knee", "l_ankle", "r_ankle"):
+            if role in roles:
+                block = slice(3 * roles[role], 3 * roles[role] + 3)
+                covariance[block, block] += np.radians(degrees)**2 * np.outer(line, line)
+    return covariance
+
+
 @dataclass(frozen=True, eq=False)
 class LatentState:
     """The unknowns, and how the markers are attached at present."""
@@ -240,7 +261,7 @@ class LatentFit:
         rest = np.zeros((len(model.skeleton.parents), 3))
         self.latent = LatentPoints(model.vertices(rest, np.zeros(self.n_betas)),
                                    model.shape_jacobian(rest)[..., :self.n_betas])
-        self.prior = gaussian_prior(model.pose_mean, model.pose_covariance)
+        self.prior = gaussian_prior(model.pose_mean, free_flexion(model, config.flexion))
         self.loose = np.isin(layout.labels, layout.loose) & config.loose
         self.reach = distance_reach(layout, config.wand)
         # usual place of a loose marker: 0.0025 is a standard deviation of 20 cm
