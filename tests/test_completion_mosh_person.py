@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from completion_bodies import worm_with_prior
 
-from completion import MoshConfig, PersonConfig, animate, find_person, mosh
+from completion import MoshConfig, PersonConfig, animate, find_person, load_layout, mosh
 from completion.mocap.files.markers import MarkerSequence
 from completion.mocap.marker_sets.layout import MarkerLayout
 from completion.mocap.mosh.mosh import PoseConfig
@@ -20,6 +20,7 @@ from completion.mocap.subject.misplaced_markers import (
     find_misplaced_markers,
 )
 from completion.mocap.subject.person import choose_frames, common_markers, judge_moves, spread_frames
+from model import load_built_in_model
 from scanprep.geometry import rotations
 from scanprep.geometry.surface import Surface
 from scanprep.judgement import Judgement
@@ -305,6 +306,24 @@ def test_a_part_keeps_its_markers(share, verdict):
     why = judgement.reasons
     assert why[0].startswith(f"{verdict} markers of the {told[0]} ({', '.join(gone)})")
     assert judgement.verdict == ("failed" if verdict == "all" else "check")
+
+
+def test_knees_that_are_bent_in_every_frame_stay_bent():
+    """The poses that a model has learned of stand, so a crouched person stood up, and markers slid along the skin."""
+    model, rng = load_built_in_model(), np.random.default_rng(1)
+    layout = load_layout("cmu41", model.template, np.array(model.info["people_vertices"]))
+    person = model.subject(np.array([0.8, -1]))
+    part = {name: j for j, name in enumerate(model.skeleton.names)}
+    poses = np.zeros((6, 16, 3))
+    for side in ("left", "right"):
+        for name, degrees in (("thigh", -50), ("shin", 70), ("foot", -20)):
+            poses[:, part[f"{name}_{side}"], 0] = np.radians(degrees)
+    poses[:, part["forearm_left"], 0] = np.radians(np.linspace(-60, -20, 6))
+    at = np.stack([layout.place(model.template.with_vertices(v)) for v in person.vertices(poses, np.zeros((6, 3)))])
+    markers = MarkerSequence(at + rng.normal(0, 0.007, (41, 3)), layout.labels, 60.0)      # beside their places
+    bent = {flexion: np.degrees(np.linalg.norm(find_person(model, markers, layout, PersonConfig(
+        flexion=flexion, frames=6)).poses[:, [part["shin_left"], part["shin_right"]]], axis=2)) for flexion in (0, 60)}
+    assert np.abs(bent[60] - 70).max() < 4 and bent[0].mean() < 63
 
 
 def test_a_marker_that_is_never_believed_is_left_out_of_the_mean():
