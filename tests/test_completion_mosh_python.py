@@ -14,8 +14,9 @@ from test_completion_keypoints import LIMBS
 from completion import MarkerSequence, MoshConfig, PersonConfig, angle_table, load_layout, mosh, write_markers
 from completion.__main__ import main
 from completion.mocap.files.opensim import write_mot
-from completion.mocap.joint_angles import anatomical_angles
+from completion.mocap.joint_angles import Known, anatomical_angles
 from completion.mocap.mosh import cli
+from completion.mocap.pose.pelvis import follow_pelvis
 from model import files
 from scanprep.skeleton.roles import find_numbered_roles
 from scanprep.synthetic.people import synthesise_walk
@@ -108,7 +109,8 @@ def test_angles_are_a_table_with_names(monkeypatch, tmp_path):
     kind, columns = found.joint_angles()
     assert isinstance(table, dict) and kind == "frame" and columns.keys() == table.keys()
     np.testing.assert_allclose(table["time"], np.arange(FRAMES) / RATE)
-    angles = anatomical_angles(motion, subject, subject.joints(motion.poses, motion.trans))
+    pelvis = follow_pelvis(motion, subject, found.layout, found.artefacts[0].repaired)
+    angles = anatomical_angles(motion, subject, subject.joints(motion.poses, motion.trans), Known(pelvis=pelvis))
     write_mot(tmp_path / "motion.mot", angles, RATE)
     lines = (tmp_path / "motion.mot").read_text().splitlines()
     at = lines.index("endheader") + 1

@@ -17,6 +17,7 @@ from scanprep.ranges import Settings
 from .joint_angles import ISB, Definitions, SegmentAxes, person_segments, rest_joints
 from .marker_sets.layout import MarkerLayout
 from .marker_sets.named import choose_layout
+from .pose.pelvis import find_worn
 
 Convention = Literal["isb", "isb-asis", "plug-in-gait"]
 _PELVIS, _FEET = ("LASI", "RASI", "LPSI", "RPSI"), ("LHEE", "LTOE", "RHEE", "RTOE")
@@ -58,10 +59,10 @@ def find_landmarks(config: AngleConfig, model: BodyModel, layout: MarkerLayout) 
     if config.convention == "isb":
         return None
     needed = _PELVIS if config.convention == "isb-asis" else (*_PELVIS, *_FEET)
-    worn = {label: word for label in needed for word in (label, f"{label}S")
-            if word in layout.labels or word in layout.aliases}
+    worn = find_worn(layout, (*needed, "SACR"))
     own = replace(layout.select([*worn.values()]), labels=tuple(worn), loose=(), wands=())
-    missing = [label for label in needed if label not in worn]
+    # the sacral marker is midway between both PSIS
+    missing = [label for label in needed if label not in worn and not ("SACR" in worn and "PSI" in label)]
     if not missing:
         return own
     try:
@@ -107,7 +108,8 @@ def turn_segments(config: AngleConfig, segments: SegmentAxes, rest: np.ndarray, 
 def pelvis_axes(at: Mapping[str, np.ndarray]) -> np.ndarray:
     """Build the axes (3, 3), columns forward, up and right, of a pelvis from LASI, RASI, LPSI and RPSI (3,), metres.
 
-    z is along the ASIS line to the right; x is in the plane of both ASIS and the middle of both PSIS.
+    z is along the ASIS line to the right; x is in the plane of both ASIS and the middle of both PSIS, or SACR without
+    them.
 
     Examples
     --------
@@ -116,7 +118,8 @@ def pelvis_axes(at: Mapping[str, np.ndarray]) -> np.ndarray:
     True
     """
     right = at["RASI"] - at["LASI"]
-    forward = 0.5 * (at["RASI"] + at["LASI"] - at["RPSI"] - at["LPSI"])
+    behind = 0.5 * (at["LPSI"] + at["RPSI"]) if {"LPSI", "RPSI"} <= at.keys() else at["SACR"]
+    forward = 0.5 * (at["RASI"] + at["LASI"]) - behind
     z = right / np.linalg.norm(right)
     return _span_axes(forward - (forward @ z) * z, z)
 

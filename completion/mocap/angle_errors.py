@@ -17,7 +17,7 @@ WEAK = 0.003                         # weight of the pose prior: so weak that on
 LEAST = 0.004                        # metres: markers are no more exact than soft tissue
 # Errors of markers on one segment go together, so a segment has fewer than it has markers. Degrees by which angles of a
 # new person change otherwise than bones do, and by which their zero is off, which static trials tell.
-TOGETHER, OF_THE_BODY, OF_THE_ZERO = 1.0, 1.2, 6.5
+TOGETHER, OF_THE_BODY, OF_THE_ZERO = 1.0, 1.2, 5.0
 
 
 @one_thread()

@@ -76,12 +76,13 @@ class SegmentAxes:
     definitions: Definitions = field(default_factory=lambda: ISB)
     turns: Mapping[str, np.ndarray] = field(default_factory=dict)        # axes (3, 3) of another convention in these
 
-    def move(self, R: np.ndarray, centres: np.ndarray) -> dict[str, np.ndarray]:
+    def move(self, R: np.ndarray, centres: np.ndarray, pelvis: np.ndarray | None = None) -> dict[str, np.ndarray]:
         """Compute the axes (T, 3, 3) of every segment from part rotations (T, J, 3, 3) and joint centres (T, J, 3).
 
         The pelvis lies along the line of the hip centres and a limb's segment along that of its two joints, as the
         rotations of parts answer to the skin around them; the turn about these lines is that of the part. A hand, which
-        ends in no joint, goes with its forearm: its angles are those between the two parts.
+        ends in no joint, goes with its forearm: its angles are those between the two parts. `pelvis` (T, 3, 3) are the
+        turns of a pelvis whose landmarks were measured, of `follow_pelvis`.
         """
         axes = {name: R[:, part] @ self.frames[name] for name, part in self.parts.items()}
         for name, (near, far, column) in self.lines.items():
@@ -89,6 +90,8 @@ class SegmentAxes:
             turn = _swing(axes[name][:, :, column], line / np.linalg.norm(line, axis=1, keepdims=True))
             for moved in {name, name.replace("forearm", "hand")} & axes.keys():
                 axes[moved] = turn @ axes[moved]
+        if pelvis is not None:
+            axes["pelvis"] = pelvis @ self.frames["pelvis"]
         return axes | {name: axes[name] @ turn for name, turn in self.turns.items()}
 
     def joints(self) -> list[Joint]:
@@ -162,6 +165,7 @@ class Known:
     errors: np.ndarray | None = None         # (T, K) degrees, of `expect_angle_errors`
     zero: Mapping[str, np.ndarray] | None = None         # of `find_static_zero`
     segments: SegmentAxes | None = None      # by the convention of an `AngleConfig`, without it ISB
+    pelvis: np.ndarray | None = None         # (T, 3, 3), of `follow_pelvis`
 
 
 NOTHING_KNOWN = Known()
@@ -242,7 +246,7 @@ def anatomical_angles(motion: Motion, subject: Subject, centres: np.ndarray, kno
     skeleton, segments = subject.skeleton, known.segments or person_segments(subject)
     R = skeleton.part_rotations(motion.poses)
     ground = ground_axes(segments.axes, R[:, segments.parts["pelvis"]])
-    degrees = angles_of(segments, ground, segments.move(R, centres), known.zero)
+    degrees = angles_of(segments, ground, segments.move(R, centres, known.pelvis), known.zero)
     pelvis = centres[:, list(segments.hips or (segments.parts["pelvis"],))].mean(axis=1) @ ground
     # an angle is determined in the frames that tell of both its segments
     joints = segments.joints()
@@ -258,16 +262,19 @@ def anatomical_angles(motion: Motion, subject: Subject, centres: np.ndarray, kno
     return JointAngles(determined, degrees[:, some], pelvis, ground, segments.missing(), guessed, errors, signs)
 
 
-def find_static_zero(motion: Motion, subject: Subject, segments: SegmentAxes | None = None) -> dict[str, np.ndarray]:
+def find_static_zero(motion: Motion, subject: Subject, known: Known = NOTHING_KNOWN) -> dict[str, np.ndarray]:
     """Find the zero of joint angles from a static trial: somebody who stands upright and still.
+
+    Segments and pelvis are those of `known`.
 
     Returns
     -------
     {str: (3, 3) float}
         By the first angle of each joint, how its segments are turned against each other on average.
     """
-    segments = segments or person_segments(subject)
-    axes = segments.move(subject.skeleton.part_rotations(motion.poses), subject.joints(motion.poses, motion.trans))
+    segments = known.segments or person_segments(subject)
+    axes = segments.move(subject.skeleton.part_rotations(motion.poses), subject.joints(motion.poses, motion.trans),
+                         known.pelvis)
     zero = {}
     for joint in segments.joints():
         if joint.proximal != "ground":

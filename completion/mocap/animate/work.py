@@ -40,6 +40,7 @@ from ..marker_sets.named import choose_layout
 from ..pose.coverage import find_coverage, find_told_parts, untold_spans
 from ..pose.follow import AnimateConfig, animate
 from ..pose.judgement import judge_motions, markers_told, motion_doubts, motion_problem
+from ..pose.pelvis import follow_pelvis
 from ..retargeting.retarget import morph_vertices, retarget
 from ..subject.misplaced_markers import MisplacedMarkers, find_misplaced_markers
 from ..subject.person import PersonConfig, PersonFit, find_person
@@ -134,7 +135,8 @@ class AnimateTask:
         segments = define_segments(self.angles, self.model, body, layout)
         errors = expect_angle_errors(motion, body, layout, segments=segments)
         write_motion_folder(output, motion, body, remove_distrusted(motion, sequence),
-                            Known(told, errors, segments=segments))
+                            Known(told, errors, segments=segments,
+                                  pelvis=follow_pelvis(motion, body, layout, sequence)))
         metrics += write_glb(output / "animation.glb", motion, body)
         page = motion_page(motion, body, sequence, path.name, metrics)
         if self.unlabelled:

@@ -127,7 +127,10 @@ def _files() -> tuple[tuple[Path, dict[str, Any]], ...]:
 
 def fitting_layout(labels: Sequence[str], template: Mesh, kept: np.ndarray | None = None
                    ) -> tuple[MarkerLayout, str]:
-    """Find the built-in layout that knows most labels, and its name; ValueError where none knows three of them."""
+    """Find the built-in layout that knows most labels, and its name; ValueError where none knows three of them.
+
+    Markers that other built-in sets know by exactly that label are added: SACR worn instead of LPSI and RPSI.
+    """
     layouts = {name: load_layout(name, template, kept).with_spellings(labels) for name in layout_names()}
     known = {name: len(layout.match_labels(labels, 0)) for name, layout in layouts.items()}
     best = max(layouts, key=lambda name: (known[name], -len(layouts[name].labels)))
@@ -139,7 +142,11 @@ def fitting_layout(labels: Sequence[str], template: Mesh, kept: np.ndarray | Non
         raise ValueError(f"labels: expected at least {fewest} of a marker set, of these {len(labels)} the sets know "
                          f"{told}. The sets: scape layout list, scape layout show NAME; your own: --layout FILE, which "
                          f"scape pick makes of the model's template. Labels found: {', '.join(labels) or 'none'}")
-    return layouts[best], best
+    fitting = layouts[best]
+    for other in layouts.values():
+        fitting = fitting.merge(other.select([label for label in other.match_labels(labels, 0) if label not in
+                                              (*fitting.labels, *fitting.aliases)]))
+    return fitting, best
 
 
 def choose_layout(model: BodyModel, given: str | Path | None, labels: Sequence[str]) -> tuple[MarkerLayout, str]:

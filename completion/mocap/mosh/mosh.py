@@ -28,6 +28,7 @@ from ..marker_sets.layout import MarkerLayout
 from ..pose.coverage import find_told_parts
 from ..pose.follow import animate
 from ..pose.marked_body import RATE, AnimateConfig
+from ..pose.pelvis import follow_pelvis
 from ..soft_tissue.follow import SoftTissueConfig, follow_soft_tissue
 from ..soft_tissue.soft_tissue import SoftTissue
 from ..subject.misplaced_markers import MisplacedMarkers, find_misplaced_markers
@@ -175,8 +176,9 @@ class MoshResult:
         motion = self.motions[number]
         segments = define_segments(self.angles, self.model, self.subject, self.layout)
         errors = expect_angle_errors(motion, self.subject, self.layout, segments=segments)
+        pelvis = follow_pelvis(motion, self.subject, self.layout, self.artefacts[number].repaired)
         return angle_table(motion, self.subject, Known(find_told_parts(self.subject, self.layout, motion), errors,
-                                                       segments=segments))
+                                                       segments=segments, pelvis=pelvis))
 
 
 @one_thread()

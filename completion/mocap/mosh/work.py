@@ -51,6 +51,7 @@ from ..marker_sets.named import choose_layout
 from ..pose.coverage import Coverage, find_coverage, find_told_parts, untold_spans
 from ..pose.follow import animate
 from ..pose.judgement import judge_motions, markers_told, motion_doubts, motion_problem
+from ..pose.pelvis import follow_pelvis
 from ..pose.witnesses import ask_witnesses, witness_doubts
 from ..retargeting.retarget import retarget
 from ..retargeting.soft_tissue import picture_transfer, retarget_soft_tissue, write_character
@@ -173,7 +174,8 @@ class _Found:
         """Find what is known of the joint angles of a sequence."""
         errors = expect_angle_errors(take.motion, take.subject, self.result.layout, self.zero is not None,
                                      self.segments)
-        return Known(self.told(take), errors, self.zero, self.segments)
+        pelvis = follow_pelvis(take.motion, take.subject, self.result.layout, take.artefacts.repaired)
+        return Known(self.told(take), errors, self.zero, self.segments, pelvis)
 
     def judgement(self, takes: Sequence[Take]) -> Judgement:
         """Judge the person and the motions of some sequences."""
@@ -265,7 +267,8 @@ def _stand(work: MoshTask, subject: Subject, layout: MarkerLayout, segments: Seg
         if name[:-2] in STANDING and abs(float(np.median(degrees))) > STANDING[name[:-2]]:
             doubts.append(f"{name} is {np.median(degrees):.0f} degrees in the static trial {work.static.name}, which "
                           "counts as 0: expected somebody who stands upright")
-    return find_static_zero(motion, subject, segments), Judgement.of(check=doubts[:3])
+    pelvis = follow_pelvis(motion, subject, layout, markers)
+    return find_static_zero(motion, subject, Known(segments=segments, pelvis=pelvis)), Judgement.of(check=doubts[:3])
 
 
 def _write(work: MoshTask, found: _Found, take: Take, context: TaskContext, settings: Mapping[str, Any]
