@@ -53,8 +53,8 @@ def test_legs_alone_say_what_they_did_not_see():
 
 @pytest.mark.parametrize(("labels", "others", "verdict", "words"), [
     (("LASI", "RASI", "C7"), 36, "failed", "3 of 39 markers used, a body needs 8"),
-    (LAYOUT.labels[:7], 0, "failed", "7 of 7"), (LAYOUT.labels, 40, "check", "39 of 79 markers used"),
-    (LAYOUT.labels, 39, "good", "")])
+    (LAYOUT.labels[:7], 0, "failed", "7 of 7"), (LEGS, 40, "check", f"{len(LEGS)} of {len(LEGS) + 40} markers used"),
+    (LAYOUT.labels, 39, "good", ""), (LAYOUT.labels, 63, "good", "")])       # of two sets at once
 def test_a_recording_of_which_little_is_used(labels, others, verdict, words):
     judgement = covered(labels, others)[0].judgement()
     assert judgement.verdict == verdict and words in judgement.why

@@ -191,6 +191,18 @@ def test_the_pelvis_is_measured_from_the_way():
     assert mean["pelvis_rotation_right_cycles"][0] > 3         # the right foot strikes with the right side ahead
 
 
+def test_a_pelvis_that_no_marker_tells_for_a_while_leaves_a_cycle_out():
+    motion, centres, angles = moving(*WALK)
+    whole = average_cycles(angles, RATE, find_gait_events(motion, subject(), centres, angles))
+    hidden = angles.degrees.copy()
+    hidden[100:110, :3] = np.nan
+    angles = replace(angles, degrees=hidden)
+    found = average_cycles(angles, RATE, find_gait_events(motion, subject(), centres, angles))
+    counts = {name: (int(n), int(m)) for name, n, m in zip(whole.names, whole.counts, found.counts, strict=True)}
+    assert counts["knee_angle_l"][0] == counts["knee_angle_l"][1] > 2
+    assert counts["pelvis_tilt_left_cycles"][1] == counts["pelvis_tilt_left_cycles"][0] - 1
+
+
 def test_the_tables(tmp_path):
     events, angles = events_of(*WALK)
     gait = average_cycles(angles, RATE, events)

@@ -130,9 +130,11 @@ class JointAngles:
 
     @property
     def turns(self) -> Rotation:
-        """Orientation (T) of the pelvis in the ground."""
+        """Orientation (T) of the pelvis in the ground; where no marker tells, that of the nearest frame."""
         k = self.names.index("pelvis_tilt")
-        return Rotation.from_euler("ZXY", self.degrees[:, k:k + 3] * self.signs, degrees=True)
+        known = np.flatnonzero(np.isfinite(self.degrees[:, k]))
+        nearest = known[np.abs(np.arange(len(self.degrees))[:, None] - known).argmin(axis=1)]
+        return Rotation.from_euler("ZXY", self.degrees[nearest, k:k + 3] * self.signs, degrees=True)
 
     def columns(self, rate: float) -> dict[str, np.ndarray]:
         """Return the columns (T,) of a table by name: time in seconds, angles in degrees, and their errors, if any."""

@@ -87,7 +87,8 @@ def _from_the_way(angles: JointAngles, begin: float, end: float) -> np.ndarray:
     turn = Rotation.from_euler("y", -np.arctan2(-way[2], way[0]))
     pelvis = (turn * angles.turns).as_matrix()
     degrees = angles.degrees.copy()
-    degrees[:, k:k + 3] = np.degrees(decompose(pelvis, "zxy")) * angles.signs
+    # + 0 * keeps the cells empty in which no marker tells
+    degrees[:, k:k + 3] = np.degrees(decompose(pelvis, "zxy")) * angles.signs + 0 * degrees[:, k:k + 3]
     return degrees
 
 
