@@ -48,7 +48,7 @@ def compare(path: Path) -> dict[str, np.ndarray]:
     return found
 
 
-def summarise(name: str, limbs: list[np.ndarray]) -> dict[str, float]:
+def summarise(limbs: list[np.ndarray]) -> dict[str, float]:
     """Compare ours with theirs over the limbs of all files, each (3, T)."""
     off = [ours - theirs for theirs, ours, _ in limbs]
     mean, spread = (np.array([measure(one) for one in off]) for measure in (np.mean, np.std))
@@ -82,11 +82,12 @@ def main() -> None:
     parser.add_argument("-o", "--output", type=Path, default="plug_in_gait.json")
     args = parser.parse_args()
     files = {path.stem: compare(path) for path in args.files}
-    summary = {name: summarise(name, limbs) for name in THEIRS if (limbs := [
-        both for found in files.values() for column, both in found.items() if column in (name, f"{name}_r", f"{name}_l")])}
+    limbs = {name: [found[column] for found in files.values() for column in (name, f"{name}_r", f"{name}_l")
+                    if column in found] for name in THEIRS}
+    summary = {name: summarise(own) for name, own in limbs.items() if own}
     for name, of in summary.items():
-        print(f"{name:16} {of['limbs']} limbs  mean {of['mean']:+.1f} ({of['mean_sd']:.1f})  spread {of['spread']:.1f}  "
-              f"rms {of['rms']:.1f}  correlation {of['correlation']:.3f}  range {100 * of['range']:.0f}%  "
+        print(f"{name:16} {of['limbs']} limbs  mean {of['mean']:+.1f} ({of['mean_sd']:.1f})  "
+              f"spread {of['spread']:.1f}  rms {of['rms']:.1f}  correlation {of['correlation']:.3f}  range {100 * of['range']:.0f}%  "
               f"within one {of['within_one']:.2f}, two {of['within_two']:.2f}")
     write_report(args.output, {"machine": machine(), "files": len(files), "summary": summary})
     draw(args.output.with_suffix(".png"), files)
