@@ -87,8 +87,8 @@ def main() -> None:
     summary = {name: summarise(own) for name, own in limbs.items() if own}
     for name, of in summary.items():
         print(f"{name:16} {of['limbs']} limbs  mean {of['mean']:+.1f} ({of['mean_sd']:.1f})  "
-              f"spread {of['spread']:.1f}  rms {of['rms']:.1f}  correlation {of['correlation']:.3f}  range {100 * of['range']:.0f}%  "
-              f"within one {of['within_one']:.2f}, two {of['within_two']:.2f}")
+              f"spread {of['spread']:.1f}  rms {of['rms']:.1f}  correlation {of['correlation']:.3f}  "
+              f"range {100 * of['range']:.0f}%  within one {of['within_one']:.2f}, two {of['within_two']:.2f}")
     write_report(args.output, {"machine": machine(), "files": len(files), "summary": summary})
     draw(args.output.with_suffix(".png"), files)
 
