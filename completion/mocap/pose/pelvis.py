@@ -55,10 +55,10 @@ def follow_pelvis(motion: Motion, subject: Subject, layout: MarkerLayout, measur
     # labels of the motion by landmark
     worn = {layout.aliases.get(label, label): landmark for landmark, label in find_worn(layout, LANDMARKS).items()}
     label_of = {worn.get(layout.aliases.get(label, label)): label for label in known.labels}
-    trusted = {label: motion.trusted[:, column] & (label not in motion.distrusted)
-               for label, column in zip(known.labels, columns, strict=True)}
+    trusted = {label: motion.trusted[:, column] & measured.seen[:, measured.labels.index(label)]
+               for label, column in zip(known.labels, columns, strict=True) if label not in motion.distrusted}
     seen = {landmark: label_of[landmark] for landmark in LANDMARKS
-            if landmark in label_of and trusted[label_of[landmark]].any()}
+            if label_of.get(landmark) in trusted and trusted[label_of[landmark]].any()}
     if not ({"LASI", "RASI"} <= seen.keys() and len(seen) > 2):
         return None
     landmarks = known.select([*seen.values()])
