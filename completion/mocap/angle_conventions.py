@@ -34,7 +34,7 @@ class AngleConfig(Settings):
     Attributes
     ----------
     convention : str
-        "isb", with the pelvis along the hip centres; "isb-asis", with the pelvis by ASIS and PSIS; or "plug-in-gait",
+        "isb", with the pelvis upright as at rest; "isb-asis", with the pelvis by ASIS and PSIS; or "plug-in-gait",
         with that pelvis, feet from heel to toe, and the signs and sequences of Plug-in Gait for pelvis and legs.
 
     Examples
