@@ -10,7 +10,7 @@ from model.statue.control.files import humanoid
 from model.statue.fit import StatueConfig, pose_automatically, pose_by_features
 from model.statue.registration import automatic
 from model.statue.registration.articulated import Articulated, BoundPoints
-from model.statue.registration.automatic import Features, find_features, guess_person_unit
+from model.statue.registration.automatic import Features, find_features, person_unit
 from model.statue.registration.clicks import MedialAxis
 from model.statue.registration.features import feature_misfit, fit_features, head_share, warp
 from model.statue.registration.person_search import LENGTH, control_body
@@ -245,10 +245,38 @@ def test_a_click_on_a_limb_finds_its_bone(control):
             assert np.linalg.norm(medial.nearest_to_ray(middle - 2 * way, way) - middle) < most
 
 
-@pytest.mark.parametrize(("length", "unit"), [(1.8, "m"), (0.8, "m"), (1750, "mm"), (171, "cm"), (70, "in")])
-def test_the_unit_is_told_by_the_height(length, unit):
+@pytest.mark.parametrize(("length", "metres"), [(1.8, 1.0), (1750, 0.001), (171, 0.01), (70, 0.0254)])
+def test_the_unit_is_told_by_the_height(length, metres):
     points = length * (SyntheticPerson().mesh.vertices @ rotations.exp(np.array([0.4, 1.0, 0])).T) / 1.75
-    assert guess_person_unit(points) == unit
+    assert person_unit(points)[0] == metres
+
+
+@pytest.mark.parametrize("length", [0.02, 1.0, 2.6, 6.0, 17.0, 500.0])
+def test_a_size_of_no_unit_is_brought_to_a_person(length):
+    points = SyntheticPerson().mesh.vertices
+    metres, words = person_unit(length / np.ptp(points[:, 2]) * points)
+    assert metres * length == pytest.approx(1.7, rel=0.02) and "brought to 1.7 m" in words
+
+
+def decimated(mesh, count):
+    """The mesh in about `count` triangles."""
+    import fast_simplification
+
+    return Mesh(*(np.asarray(out, dtype=kind) for out, kind in zip(fast_simplification.simplify(
+        mesh.vertices.astype(np.float32), mesh.faces.astype(np.int32), 1 - count / len(mesh.faces)),
+        (float, int), strict=True)))
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore:scan")
+@pytest.mark.parametrize(("count", "size"), [(1600, 0.01), (800, 30.0)])
+def test_a_person_of_few_triangles_and_of_any_size_is_found(control, count, size):
+    person = SyntheticPerson()
+    scan = decimated(person.mesh, count)
+    found = find_features(control, scan.with_vertices(size * scan.vertices))
+    joints = find_features(control, person.mesh).joints
+    assert found.problem is None and found.joints.keys() == joints.keys()
+    assert max(np.linalg.norm(found.joints[name] / size - joints[name]) for name in joints) < 0.025
 
 
 @pytest.mark.slow
@@ -271,7 +299,7 @@ def test_a_person_is_found_upside_down_in_millimetres_with_holes_and_without_an_
     dense, faces, before = subdivide_to_size(vertices, person.mesh.faces, 0.015, return_index=True)
     scan, _ = Mesh(seen(dense), faces).submesh(keep[before])
     found = find_features(control, scan)
-    assert guess_person_unit(scan.vertices) == "mm" and found.problem is None
+    assert person_unit(scan.vertices)[0] == 0.001 and found.problem is None
     assert {"r_wrist", "right middle finger", "right wrist"} <= set(found.missing)
     for name, part in {"l_elbow": 5, "l_wrist": 6, "l_hip": 10, "l_knee": 11, "r_knee": 14, "skullbase": 3}.items():
         assert np.linalg.norm(found.joints[name] - seen(joints[part])) < 40, name

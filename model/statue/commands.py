@@ -18,7 +18,6 @@ from scanprep.cli import MM, Output, PersonUnit, ScanArg
 from scanprep.console import Metric, Outcome, bar, judgement_of, judgement_row, write_report
 from scanprep.folders import FolderCommand, do_one, figure
 from scanprep.geometry.files import write_mesh
-from scanprep.geometry.format_common import UNITS
 from scanprep.geometry.mesh import Mesh
 from scanprep.judgement import NAMED, Judgement, implausible_body
 from scanprep.pictures.gltf import write_animated_glb
@@ -53,7 +52,7 @@ from .detail.texels import bake_texture, scan_look
 from .files import BODY, body_model, load_statue, save_statue, write_body, write_for_programs, write_statue_glb
 from .fit import FittedStatue, StatueConfig, fit_statue
 from .motion.motions import follower_of, read_statue_motion, write_body_motion
-from .registration.automatic import guess_person_unit
+from .registration.automatic import person_unit
 from .registration.clicks import read_features
 from .report import in_motion, motion_pictures, parts_without_data, statue_page, statue_picture
 
@@ -222,20 +221,21 @@ def judge_statue(statue: FittedStatue, scan: Mesh, finest: Level, left_out: Sequ
 def read_scan(inputs: ScanTask, unit: str | None) -> tuple[Mesh, Texture | None, list[Metric], list[str]]:
     """Read the body of a scan and its texture in metres, with figures and doubts of the cleaning.
 
-    Without a unit it is metres where features are given, which may be on anything, else that of a person.
+    Without a unit it is metres where features are given, which may be on anything, else that of a person, and
+    where no unit gives a person's size it is brought to 1.7 m.
     """
     sought = unit is None and inputs.landmarks is None
     unit = "m" if sought else unit
     scan, texture = read_sound_surface(inputs.scan, unit), read_texture(inputs.scan, unit)
     rows = [Metric("scan, triangles", len(scan.faces))]
-    metre = UNITS[guess_person_unit(scan.vertices)] if sought else 1.0
+    metre = person_unit(scan.vertices)[0] if sought else 1.0
     cleaned = clean_scan(scan.with_vertices(metre * scan.vertices))
     doubts = cleaning_doubts(cleaned)
     body = cleaned.mesh
     if sought:                               # guess again from the body alone, since a floor may have any size
-        likely = guess_person_unit(body.vertices / metre)
-        body, metre = body.with_vertices(UNITS[likely] / metre * body.vertices), UNITS[likely]
-        rows.append(Metric("unit of the scan", f"{likely}, from the height of the body"))
+        likely, words = person_unit(body.vertices / metre)
+        body, metre = body.with_vertices(likely / metre * body.vertices), likely
+        rows.append(Metric("unit of the scan", words))
     left = 1 - float(cleaned.kept.mean())
     if left > 0:
         rows.append(Metric("left out as floor, furniture, specks", 100 * left, "% of the points"))

@@ -79,6 +79,31 @@ def subdivide_adaptive(mesh: Mesh, chart: Chart, displaced: Displaced, tolerance
     return _subdivide(mesh, chart, level, lambda now: _find_curved_sides(now, displaced, tolerance))
 
 
+def divide_long_edges(mesh: Mesh, longest: float) -> Mesh:
+    """Split edges of a scan until none is longer than `longest`, so that its vertices sample the surface evenly.
+
+    Examples
+    --------
+    >>> square = Mesh(np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]]), [[0, 1, 2], [0, 2, 3]])
+    >>> len(divide_long_edges(square, 0.8).faces)
+    8
+    """
+    corners = mesh.corners
+    most = np.linalg.norm(corners - np.roll(corners, -1, axis=1), axis=2).max(initial=0.0)
+    if most <= longest:
+        return mesh
+    mesh, _ = mesh.submesh(np.ones(len(mesh.faces), dtype=bool))           # without vertices of no triangle
+
+    def find_long_sides(now: _Corners) -> np.ndarray:
+        first, edge = _sides(now.vertex)
+        ends = now.bary @ mesh.corners[now.parent]
+        length = np.linalg.norm(ends - np.roll(ends, -1, axis=1), axis=2).ravel()
+        return (length[first] > longest)[edge]
+
+    no_chart = Chart(np.zeros((len(mesh.vertices), 2)), mesh.faces)
+    return _subdivide(mesh, no_chart, int(np.ceil(np.log2(most / longest))) + 2, find_long_sides).mesh(mesh)
+
+
 def _subdivide(mesh: Mesh, chart: Chart, level: int, choose: Callable[[_Corners], np.ndarray]) -> Subdivision:
     """Split the sides (f, 3) that `choose` marks, `level` times or until it marks none."""
     now = _Corners(mesh.faces, chart.faces, np.tile(np.eye(3), (len(mesh.faces), 1, 1)), np.arange(len(mesh.faces)),

@@ -17,6 +17,7 @@ from scanprep.threads import one_thread, search_threads
 from scanprep.words import number_of
 
 from ..control.model import ControlModel
+from ..detail.subdivision import divide_long_edges
 from .features import FeatureFit, fit_features
 from .person_search import find_stand
 
@@ -24,6 +25,10 @@ from .person_search import find_stand
 # Six synthetic persons: 11 to 13 mm, ratio 1.7 to 3.3. Nine real ones, five of them bent: 18 to 21 mm, 1.5 to 2.9.
 # Fronts and sides alone: 21 mm, 1.35 to 1.6. A cylinder: 47 mm, 1.13; a chair: 56 mm; two people: 65 and 70 mm.
 OFF, MARGIN = 0.042, 1.05
+# metres: length of a person, and the range in which a file's own unit is believed; others are seldom people
+TALL, SMALLEST, LARGEST = 1.7, 1.07, 2.31
+# metres: edges of the control model are 40 mm. At 25 mm a person of 800 triangles gives the joints of the full mesh
+LONGEST_EDGE = 0.025
 DOUBTED_OFF, DOUBTED_MARGIN = 0.025, 1.2         # a leg alone has 25 mm; dressed persons need a look
 
 
@@ -46,22 +51,20 @@ def find_features(control: ControlModel, scan: Mesh) -> Features:
     Unit and axes of the scan need not be known. It may have holes, or show a part of a person. The control model, z up
     and facing -y, is placed in many ways; the best are posed to fit the scan, and one of them is registered.
     """
-    if len(scan.vertices) < 100:
-        raise ValueError(f"scan: expected a person of at least 100 points, got {scan}")
+    if not len(scan.faces) and len(scan.vertices) < 100:
+        raise ValueError(f"scan: expected a person of triangles or of at least 100 points, got {scan}")
     scan = sanitise(scan)
-    unit = guess_person_unit(scan.vertices)
-    metres = UNITS[unit]
-    data = scan if len(scan.vertices) < 40_000 else scan.vertices[thin(scan.vertices, 0.007 / metres)]
-    stands = find_stand(control, data, metres)
+    metres, unit = person_unit(scan.vertices)
+    data = sample_evenly(scan, metres)
+    stands = find_stand(control, data)
     best = stands[0]
     margin = stands[1].off / best.off
-    problem = nobody_problem(best.off, margin, f"{unit}, {metres * _length(scan.vertices):.2f} m long")
+    problem = nobody_problem(best.off, margin, unit)
     if problem:
         return Features({}, {}, (*control.skeleton.names, *control.landmarks), None, None, problem)
-    placed = data.with_vertices(metres * data.vertices) if isinstance(data, Mesh) else metres * data
-    result = register(best.mesh, placed, config=RegistrationConfig(graph=RegistrationConfig().graph[-2:]),
+    result = register(best.mesh, data, config=RegistrationConfig(graph=RegistrationConfig().graph[-2:]),
                       start=np.eye(4))
-    joints, points, missing = _features(control, result, placed, metres)
+    joints, points, missing = _features(control, result, data, metres)
     fit = fit_features(control, joints, points) if len(joints) + len(points) > 2 else None
     registered = control.mesh.with_vertices(result.mesh.vertices / metres)
     problem = why_uncertain(best.off, margin, result.uncovered) if fit else (
@@ -69,6 +72,12 @@ def find_features(control: ControlModel, scan: Mesh) -> Features:
         "too few to place a person: "
         "a part of one only?")
     return Features(joints, points, missing, registered, fit, problem)
+
+
+def sample_evenly(scan: Mesh, metres: float) -> Mesh | np.ndarray:
+    """Bring a scan to metres with vertices that measure its surface: long edges divided, or dense points thinned."""
+    scan = divide_long_edges(scan.with_vertices(metres * scan.vertices), LONGEST_EDGE)
+    return scan if len(scan.vertices) < 40_000 else scan.vertices[thin(scan.vertices, 0.007)]
 
 
 def nobody_problem(off: float, margin: float, size: str) -> str | None:
@@ -93,10 +102,21 @@ def why_uncertain(off: float, margin: float, missed: float) -> str | None:
     return "; ".join(reasons) + ": look at it, or click" if reasons else None
 
 
-def guess_person_unit(points: np.ndarray) -> str:
-    """Guess the unit in which points (n, 3) are about as long as a person, 1.7 m."""
+def person_unit(points: np.ndarray) -> tuple[float, str]:
+    """Choose how many metres a unit of points (n, 3) has, so that they are as long as a person; and say it in words.
+
+    Where no known unit makes them that long, as for most figures of artists, they are brought to 1.7 m.
+
+    Examples
+    --------
+    >>> person_unit(np.diag([1750.0, 400, 200]))
+    (0.001, 'mm, from the height of the body')
+    """
     longest = max(_length(points), 1e-12)
-    return min(UNITS, key=lambda unit: abs(np.log(longest * UNITS[unit] / 1.7)))                # metres
+    unit = min(UNITS, key=lambda unit: abs(np.log(longest * UNITS[unit] / TALL)))
+    if SMALLEST <= longest * UNITS[unit] <= LARGEST:
+        return UNITS[unit], f"{unit}, from the height of the body"
+    return TALL / longest, f"1 unit = {TALL / longest:.3g} m, brought to {TALL} m as no unit makes it a person's size"
 
 
 def _length(points: np.ndarray) -> float:

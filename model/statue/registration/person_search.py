@@ -60,10 +60,10 @@ def control_body(control: ControlModel) -> SkinningModel:
         pose_examples=np.zeros((0, J, 3)) if known is None else known, joint_components=joints)
 
 
-def find_stand(control: ControlModel, scan: Mesh | np.ndarray, metres: float) -> list[Stand]:
-    """Find the best stand in a scan whose unit is `metres`, and the best one that faces another way."""
+def find_stand(control: ControlModel, scan: Mesh | np.ndarray) -> list[Stand]:
+    """Find the best stand in a scan of a person's size, metres, and the best one that faces another way."""
     body = as_body(control_body(control))
-    fit = scan_fit(body, prepare_scan(scan, metres=metres), np.zeros(0, dtype=np.int64), np.zeros((0, 3)), SETTINGS)
+    fit = scan_fit(body, prepare_scan(scan), np.zeros(0, dtype=np.int64), np.zeros((0, 3)), SETTINGS)
     coarse = fit.few()
     x, _ = with_limbs(fit, coarse, best_starts(coarse, first_starts(fit, coarse)))
     x = solve_jointly(fit, coarse, x, lambda done: None).x

@@ -22,6 +22,7 @@ from scanprep.ranges import Count, Positive, Range, Settings
 from scanprep.registration.folds import find_inverted_triangles, unfold
 from scanprep.threads import one_thread
 
+from ..detail.subdivision import divide_long_edges
 from .local_shape import local_shape
 from .soft_assignment import DirectedPoints, Slack, assign_softly
 
@@ -144,13 +145,15 @@ class _Fit:
 
     def __init__(self, rest: Mesh, start: np.ndarray, scan: Mesh, config: SurfaceFitConfig, hidden: np.ndarray | None
                  ) -> None:
+        # ten points of the scan for each vertex attract the mesh; long triangles would do so by their corners only
+        spacing = max(float(np.sqrt(float(scan.face_areas.sum()) / (10 * len(start)))), 1e-4)
+        scan = divide_long_edges(scan, 2 * spacing)
         target = scan_target(scan)
         self.rest, self.target, self.surface, self.config = rest, target, Surface(scan), config
         self.shape = local_shape(rest)
         self.points = DirectedPoints(target.points, target.normals, target.border)
         self.stiffness = csc_array(self.shape.plane.T @ diags_array(self.shape.weights) @ self.shape.plane)
-        # ten points of the scan for each vertex attract the mesh
-        self.sample = target.thin(max(float(np.sqrt(float(scan.face_areas.sum()) / (10 * len(start)))), 1e-4))
+        self.sample = target.thin(spacing)
         self.shown = np.ones(len(start), dtype=bool) if hidden is None else ~np.asarray(hidden)
         self.reach = config.reach * float(np.sqrt(rest.with_vertices(start).face_areas.sum()))
 
