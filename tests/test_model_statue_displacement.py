@@ -210,6 +210,23 @@ def test_a_hole_over_the_seam_is_filled_as_high_as_all_around_it(control, places
     assert (heights[kind == HOLE] >= known.min()).all() and (heights[kind == HOLE] <= known.max()).all()
 
 
+@pytest.mark.parametrize(("rise", "kind"), [(0.002, MEASURED), (0.02, HOLE)])
+def test_an_island_in_a_hole_counts_where_it_continues_the_surface_and_is_no_thorn(control, places, rise, kind):
+    """Lone pixels made thorns of 75 mm at ragged holes."""
+    ball, (texels, p, _) = globe(160, 300, R)[0], places
+    on_ball = R * p / np.linalg.norm(p, axis=1, keepdims=True)
+    pole = on_ball[np.flatnonzero(texels.inside)[texels.inside.sum() // 2]]
+    apart = np.linalg.norm(ball.corners.mean(axis=1) - pole, axis=1)
+    island = ball.with_vertices(ball.vertices * (1 + rise / R)).submesh(apart < 0.005)[0]
+    cut = ball.submesh(apart > 0.03)[0]
+    found = bake_displacement(control, Mesh(np.concatenate([cut.vertices, island.vertices]), np.concatenate(
+        [cut.faces, island.faces + len(cut.vertices)])), DisplacementConfig(size=SIZE))
+    middle = texels.pixels[texels.inside & (np.linalg.norm(on_ball - pole, axis=1) < 0.002)]
+    assert len(middle) and (found.coverage.ravel()[middle] == kind).all()
+    heights = bake_displacement(control, cut, DisplacementConfig(size=SIZE)).heights
+    assert np.abs(found.heights - heights).max() < (0.003 if kind == MEASURED else 0.0005)
+
+
 @pytest.fixture(scope="module")
 def with_vectors(control):
     return bake_displacement(control, mushroom(R), DisplacementConfig(size=384, vectors=True))

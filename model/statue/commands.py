@@ -52,6 +52,7 @@ from .detail.texels import bake_texture, scan_look
 from .files import BODY, body_model, load_statue, save_statue, write_body, write_for_programs, write_statue_glb
 from .fit import FittedStatue, StatueConfig, fit_statue
 from .motion.motions import follower_of, read_statue_motion, write_body_motion
+from .outer import keep_outer
 from .registration.automatic import person_unit
 from .registration.clicks import read_features
 from .report import in_motion, motion_pictures, parts_without_data, statue_page, statue_picture
@@ -228,6 +229,9 @@ def read_scan(inputs: ScanTask, unit: str | None) -> tuple[Mesh, Texture | None,
     unit = "m" if sought else unit
     scan, texture = read_sound_surface(inputs.scan, unit), read_texture(inputs.scan, unit)
     rows = [Metric("scan, triangles", len(scan.faces))]
+    scan, inside = keep_outer(scan)
+    if inside:
+        rows.append(Metric("inside the surface, left out", 100 * inside, "% of the surface"))
     metre = person_unit(scan.vertices)[0] if sought else 1.0
     cleaned = clean_scan(scan.with_vertices(metre * scan.vertices))
     doubts = cleaning_doubts(cleaned)
