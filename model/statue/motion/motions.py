@@ -143,7 +143,7 @@ class BoundControl:
         if registered is not None and registered.shape != body.vertices.shape:
             raise ValueError(f"registered: expected shape {body.vertices.shape}, got {registered.shape}")
         near = body if registered is None else body.with_vertices(registered)
-        self._bind = _bound(mesh, near)
+        self._bind = bind_points(mesh, near)
         # weights of the edges whose rotation is averaged around each vertex of the body: over four rings
         N, edges = len(body.vertices), body.edges
         ends = sparse.gatherer(edges.T.ravel(), N) @ vstack([eye_array(len(edges))] * 2)
@@ -170,7 +170,7 @@ class BoundControl:
         return np.asarray(self._bind @ body + np.einsum("nab,nb->na", R, self._offset))
 
 
-def _bound(mesh: Mesh, body: Mesh) -> csr_array:
+def bind_points(mesh: Mesh, body: Mesh) -> csr_array:
     """Bind each control vertex to a body point with a compatible normal: barycentric weights (n, N)."""
     close = Surface(body).closest(mesh.vertices)
     corners, weights = body.faces[close.faces].copy(), close.bary.copy()
