@@ -13,7 +13,14 @@ from model.motion.onto import read_motion
 from model.rig import joint_places
 from model.skinning import SkinningModel
 from model.statue.control.files import humanoid
-from model.statue.motion.motions import BoundControl, bind_points, bvh_motion, own_motion, people_motion, write_body_motion
+from model.statue.motion.motions import (
+    BoundControl,
+    bind_points,
+    bvh_motion,
+    own_motion,
+    people_motion,
+    write_body_motion,
+)
 from scanprep.geometry import rotations
 from scanprep.geometry.storage import StorageError
 from scanprep.geometry.surface import Surface

@@ -294,15 +294,16 @@ def animate(statue: StatueArg, motion: MotionArg, output: Output, model: Path | 
             own_mesh: bool = False, names: Names | None = None) -> Outcome:
     """A statue in motion: its skeleton moves the control mesh, the detail stands on the moving normals.
 
-    The motion is BVH; or .npz of the synthetic people, or of the statue's own body.npz, as scape animate writes it from
-    markers. With --model the control mesh follows a learned model instead of plain skinning, with all that the model
+    The motion is BVH, motion.npz of any of our commands, AMASS, or a table of key poses (keys.csv). Parts are matched
+    by their names, and rest poses may differ. With --model the control mesh follows a learned model instead of plain skinning, with all that the model
     knows of how skin moves; the motion is then one of that model.
 
     Example: scape statue animate statue walk.bvh -o walking
 
     Args:
         statue: Folder of scape statue fit.
-        motion: .bvh, or .npz with poses, trans and mocap_frame_rate.
+        motion: .bvh, .npz with poses, trans and mocap_frame_rate, or .csv with time and PART_rx, PART_ry, PART_rz in
+            degrees.
         output: Folder to write: statue.glb, motion.npz with its model body.npz, motion.gif, and meshes on demand.
         model: Learned model (.npz) that the control mesh follows.
         registered: The model's template on the scan, in its triangles; else it is brought there.
@@ -322,7 +323,7 @@ def animate(statue: StatueArg, motion: MotionArg, output: Output, model: Path | 
     if model is None:
         if registered is not None:
             raise UsageError("--registered: expected --model with it")
-        moved = read_statue_motion(loaded, motion, rate)
+        moved, doubts = read_statue_motion(loaded, motion, rate)
         bodies, frame_rate = control.rig.vertices(moved.poses, moved.trans), moved.rate
         output.mkdir(parents=True, exist_ok=True)
         write_statue_glb(output / "statue.glb", control, detailed(control.mesh.vertices), fine, loaded.texture,
