@@ -6,7 +6,7 @@ skinning blends rotations at every vertex (`model.blended`).
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -207,6 +207,11 @@ class Subject:
         Joints are affine combinations of the surface around them; an imported model has its own.
         """
         return self._joints.evaluate(poses, trans)
+
+    @cached_property
+    def rest_skeleton(self) -> Skeleton:
+        """The skeleton with the joints of this body at rest."""
+        return replace(self.skeleton, joints=self.joints(np.zeros((len(self.skeleton.parents), 3))))
 
     @cached_property
     def _joints(self) -> PointOperator:

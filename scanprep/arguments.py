@@ -20,7 +20,7 @@ from .ranges import marks
 GROUPS = {      # an argument has the same name and meaning in all commands; what is not listed belongs to the method
     "input": "model template poses shapes train_shapes bodies body target source motion control first registered "
              "skeleton candidates image correspondences views cameras rate",
-    "output": "output out save_in format surfaces meshes level",
+    "output": "output out save_in format surfaces meshes level own_mesh names",
     "what is known": "landmarks template_landmarks source_landmarks features subject subjects "
                      "subject_prefix layout mask unit up betas own_body pose sex",
     "method": "",

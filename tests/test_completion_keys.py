@@ -10,8 +10,8 @@ from test_completion_animate_cli import told
 from test_completion_motions import WRITTEN
 
 from completion.__main__ import main
-from completion.mocap.animate.keys import holds_keys, interpolate_rotations, read_keys
 from completion.motion import Motion
+from model.motion.keys import holds_keys, interpolate_rotations, read_keys
 from scanprep.geometry.rotations import exp
 from scanprep.geometry.storage import StorageError
 
@@ -35,7 +35,7 @@ def table(path, text):
 
 
 def keyed(tmp_path, text, rate=10.0):
-    return read_keys(table(tmp_path / "keys.csv", text), small_people().subject(None), None, rate)
+    return read_keys(table(tmp_path / "keys.csv", text), small_people().skeleton, None, None, rate)
 
 
 def test_joints_go_the_shorter_way_and_stay_where_two_keys_are_alike():

@@ -13,7 +13,14 @@ from model.motion.onto import read_motion
 from model.rig import joint_places
 from model.skinning import SkinningModel
 from model.statue.control.files import humanoid
-from model.statue.motion.motions import BoundControl, _bound, bvh_motion, own_motion, people_motion, write_body_motion
+from model.statue.motion.motions import (
+    BoundControl,
+    bind_points,
+    bvh_motion,
+    own_motion,
+    people_motion,
+    write_body_motion,
+)
 from scanprep.geometry import rotations
 from scanprep.geometry.storage import StorageError
 from scanprep.geometry.surface import Surface
@@ -302,5 +309,5 @@ def test_a_vertex_is_bound_to_its_own_side(learned):
     low = int(squeezed.vertices[:, 2].argmin())
     vertices = squeezed.vertices.copy()
     vertices[low, 2] += 0.8 * np.ptp(rest.vertices[:, 2])                # up through the body, still facing down
-    bound = _bound(squeezed.with_vertices(vertices), rest)[[low]]
+    bound = bind_points(squeezed.with_vertices(vertices), rest)[[low]]
     assert (bound @ rest.vertex_normals)[0, 2] < -0.3

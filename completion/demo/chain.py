@@ -14,6 +14,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from model import BodyModel, LearnConfig, Subject, fit_pose, learn_scape, load_model
+from model.motion.files import skeleton_arrays
 from scanprep.batch.opening import workspace
 from scanprep.batch.room import TaskContext, substeps
 from scanprep.batch.workspace import KeptSteps, Task, Workspace
@@ -306,7 +307,8 @@ class Demo:
 
         def make(folder: Path) -> None:
             with self.bar("following the markers") as progress:
-                animate(subject, sequence, layout, progress=progress).save(folder / MOTION)
+                motion = animate(subject, sequence, layout, progress=progress)
+            motion.save(folder / MOTION, **skeleton_arrays(subject.rest_skeleton))
 
         self.space.step("animation", (self.folder / MODEL, self.folder / "markers"), make)
         return Motion.load(self.folder / MOTION)

@@ -66,7 +66,7 @@ def export(model: ModelArg, output: Output, betas: tuple[Beta, ...] = (), own_bo
         unit: Of the lengths in a BVH file; cm.
         up: Axis of the model that points up, which GLB and BVH turn to y; else that of the largest extent.
         root: Part that the skeleton hangs on, as pelvis.
-        names: Whose names the bones of a person have: mixamo, vrm, h-anim or opensim.
+        names: Whose names the bones of a person have: mixamo, unity, unreal, vrm, h-anim or opensim.
         ground: Soles on height 0, of the body and of the lowest frame.
         front: Face to the viewer: +z in GLB and BVH, -y of a mesh with z up.
         fps: Frames a second of the motion, such as 24 or 30; else as many as its file has.

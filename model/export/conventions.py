@@ -35,7 +35,7 @@ def for_programs(rig: Rig, poses: np.ndarray, trans: np.ndarray, up: int, root: 
         0, 1 or 2: the axis of the body that points up.
     root : str, optional
         The part that the skeleton hangs on.
-    names : "mixamo", "vrm", "h-anim" or "opensim", optional
+    names : "mixamo", "unity", "unreal", "vrm", "h-anim" or "opensim", optional
         Whose names the bones have.
     ground : bool
         The lowest point at rest, and the lowest of the motion, at height 0.

@@ -94,11 +94,11 @@ def encode_skinned_glb(rig: Rig, poses: np.ndarray | None = None, trans: np.ndar
     mesh: dict[str, Any] = {"name": "body", "primitives": [_primitive(glb, rig, targets, material, U)]}
     if names:
         mesh |= {"weights": [0] * len(names), "extras": {"targetNames": names}}
-    document = {"scene": 0, "scenes": [{"nodes": [0, 1]}], "nodes": _nodes(rig), "meshes": [mesh],
-                "skins": [_skin(glb, rig)], **_materials(glb, material, rig.mesh.colors is not None)}
+    document = {"scene": 0, "scenes": [{"nodes": [0, 1]}], "nodes": build_nodes(rig), "meshes": [mesh],
+                "skins": [add_skin(glb, rig)], **_materials(glb, material, rig.mesh.colors is not None)}
     if poses is not None:
         poses, trans = check_motion(rig.skeleton, poses, trans, rate)
-        document["animations"] = [_animation(glb, rig, poses @ U, trans @ U, rate, len(names))]
+        document["animations"] = [add_animation(glb, rig, poses @ U, trans @ U, rate, len(names))]
     elif rig.correctives is not None:
         raise ValueError("correctives: expected the poses that they belong to")
     return glb.pack(document, up)
@@ -163,7 +163,7 @@ def _materials(glb: Glb, material: Material | None, colored: bool) -> dict[str, 
     return {"materials": [out], "images": images, "textures": textures, "samplers": [edges]}
 
 
-def _nodes(rig: Rig) -> list[dict[str, Any]]:
+def build_nodes(rig: Rig) -> list[dict[str, Any]]:
     """Build the nodes: the mesh first, then the joints; joint j is node j + 1."""
     J = len(rig.skeleton.parents)
     turned = _quaternions(rig, np.zeros((1, J, 3)))[0]
@@ -176,7 +176,8 @@ def _nodes(rig: Rig) -> list[dict[str, Any]]:
     return nodes
 
 
-def _skin(glb: Glb, rig: Rig) -> dict[str, Any]:
+def add_skin(glb: Glb, rig: Rig) -> dict[str, Any]:
+    """Add the inverse bind matrices of a rig's joints, nodes 1 to J; return its entry of `skins`."""
     J = len(rig.skeleton.parents)
     inverse = np.tile(np.eye(4), (J, 1, 1))                                   # column after column
     inverse[:, :3, :3] = rig.axes
@@ -190,7 +191,8 @@ def _quaternions(rig: Rig, poses: np.ndarray) -> np.ndarray:
     return continuous_quaternions(rig.local_rotations(poses))
 
 
-def _animation(glb: Glb, rig: Rig, poses: np.ndarray, trans: np.ndarray, rate: float, targets: int) -> dict[str, Any]:
+def add_animation(glb: Glb, rig: Rig, poses: np.ndarray, trans: np.ndarray, rate: float, targets: int) -> dict[str, Any]:
+    """Add a motion of the joints\' nodes, in the axes of the rig; return its entry of `animations`."""
     q = _quaternions(rig, poses)
     times = glb.add(np.arange(len(poses)) / rate, "SCALAR", None, bounds=True)
     places = glb.add(rig.skeleton.joints[0] + trans, "VEC3", None)

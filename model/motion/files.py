@@ -11,6 +11,7 @@ import numpy as np
 from scanprep.geometry import storage
 from scanprep.geometry.storage import StorageError
 from scanprep.ranges import BETAS, TINY, TURNS, Range
+from scanprep.skeleton.tree import Skeleton
 
 from ..body import BodyModel
 from ..files import KINDS
@@ -25,6 +26,7 @@ _PIECES = ({"root_orient": 3, "global_orient": 3}, {"pose_body": 63, "body_pose"
            {"pose_jaw": 3, "jaw_pose": 3}, {"pose_eye": 6, "leye_pose": 3}, {"reye_pose": 3},
            {"pose_hand": 90, "left_hand_pose": 45}, {"right_hand_pose": 45})
 # motion files of other programs by their ending: what they are, and what to export instead
+SKELETON = ("part_names", "part_parents", "rest_joints")        # arrays of the skeleton that a motion belongs to
 _ROTATIONS = "holds rotations of segments and no markers; export BVH in its place, for scape animate"
 OTHER_MOTIONS = {
     ".fbx": "FBX: open it in Blender or MotionBuilder and export BVH, for scape animate",
@@ -45,11 +47,24 @@ class StoredMotion:
     gender: str
     made_for: str                    # the kind of model, "" where the file does not say
     more: dict[str, np.ndarray]      # further arrays that were asked for
+    skeleton: Skeleton | None = None     # at rest, None where the file does not hold it
 
     @property
     def of_family(self) -> bool:
         """Whether this is a motion of the SMPL family, as in AMASS."""
         return self.made_for.lower().startswith(FAMILY) or (not self.made_for and self.poses.shape[1] in JOINTS)
+
+
+def skeleton_arrays(skeleton: Skeleton) -> dict[str, np.ndarray]:
+    """Return the arrays that say in a motion file whose motion it is: names, parents and joints at rest of the parts.
+
+    Examples
+    --------
+    >>> skeleton_arrays(Skeleton([0, 1], [-1, 0], np.zeros((2, 3)), ("trunk", "head")))["part_names"].tolist()
+    ['trunk', 'head']
+    """
+    values = np.array(skeleton.names), skeleton.parents, skeleton.joints
+    return dict(zip(SKELETON, values, strict=True))
 
 
 def is_motion(path: Path) -> bool:
@@ -85,7 +100,7 @@ def read_motion_file(path: str | Path, more: Collection[str] = (), parts: int | 
         raise StorageError(f"{path}: expected a motion (.npz), found {OTHER_MOTIONS[path.suffix.lower()]}")
     place_names = ("trans", "transl")
     what, wanted = "a motion (.npz)", (
-        "poses", *place_names, "betas", *RATES, *(name for piece in _PIECES for name in piece), *more)
+        "poses", *place_names, "betas", *RATES, *(name for piece in _PIECES for name in piece), *SKELETON, *more)
     # only known arrays are read; poses in pieces are joined
     a = storage.load_arrays(path, what, wanted)
     for name in ("gender", "surface_model_type"):        # pickled objects in some files: these are skipped
@@ -152,7 +167,15 @@ def _restore_motion(path: Path, a: dict[str, np.ndarray], more: Collection[str],
     TURNS.check(poses, "poses")
     return StoredMotion(poses, storage.numbers(a, "trans", T, 3).astype(np.float64), betas if betas.size else None,
                         rate, storage.text(a, "gender", "neutral"),
-                        made_for, {name: a[name] for name in more if name in a})
+                        made_for, {name: a[name] for name in more if name in a}, _skeleton(a, poses.shape[1]))
+
+
+def _skeleton(a: dict[str, np.ndarray], parts: int) -> Skeleton | None:
+    """Build the skeleton at rest from the arrays of a motion of some parts; None where they are not there."""
+    if not a.keys() >= set(SKELETON):
+        return None
+    return Skeleton(np.arange(parts), storage.numbers(a, "part_parents", parts, kinds="iu"),
+                    storage.numbers(a, "rest_joints", parts, 3), tuple(str(name) for name in a["part_names"]))
 
 
 def check_ours(path: str | Path, stored: StoredMotion, where: str = "") -> None:

@@ -6,6 +6,10 @@ from functools import cached_property
 
 import numpy as np
 
+from scanprep.skeleton.tree import Skeleton
+
+from ..rig import joint_places
+
 
 @dataclass(frozen=True, eq=False)
 class MovingSkeleton:
@@ -29,3 +33,10 @@ class MovingSkeleton:
         for j in range(1, len(out)):
             out[j] += out[self.parents[j]]
         return out
+
+
+def set_in_motion(skeleton: Skeleton, poses: np.ndarray, trans: np.ndarray, rate: float) -> MovingSkeleton:
+    """Build the moving skeleton of poses (T, J, 3), radians, and trans (T, 3), metres, of a body's parts."""
+    offsets = skeleton.joints - np.where(skeleton.parents[:, None] < 0, 0, skeleton.joints[skeleton.parents])
+    return MovingSkeleton(skeleton.names, skeleton.parents, offsets, {}, skeleton.part_rotations(poses),
+                          joint_places(skeleton, poses, trans), rate)

@@ -18,9 +18,9 @@ from .amass import BODY, UNCERTAIN, moving_body, with_joints
 from .bvh import read_bvh
 from .error import RetargetingError, TwistError, measure_error, measure_twist
 from .files import betas_for, check_ours, read_motion_file
-from .moving import MovingSkeleton
+from .moving import MovingSkeleton, set_in_motion
 from .retarget import Pairing, Retargeted, retarget_pair
-from .same import copy_motion
+from .same import copy_motion, same_skeleton
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,7 +70,7 @@ def read_motion(path: str | Path, model: BodyModel, subject: Subject | None = No
                 rate: float | None = None) -> BodyMotion:
     """Read a motion file for a model: its own (`.npz`), AMASS (`.npz`) or BVH.
 
-    A motion of the model's parts is taken as it is. One of the same skeleton, or of a model of the same family, is
+    A motion of the model's parts and rest pose is taken as it is. One of the same skeleton, or of a model of the same family, is
     copied. A motion of another skeleton is retargeted: segments keep their directions, see `model.motion.retarget`.
 
     Parameters
@@ -122,6 +122,9 @@ def read_motion(path: str | Path, model: BodyModel, subject: Subject | None = No
                                f"found {stored.poses.shape[1]}")
         return _onto(path, moving_body(stored)[0], model, subject, UNCERTAIN, stored.gender)
     check_ours(path, stored)
+    if stored.skeleton is not None and not same_skeleton(stored.skeleton, model.skeleton):
+        moving = set_in_motion(stored.skeleton, stored.poses, stored.trans, stored.rate)
+        return _onto(path, moving, model, subject, gender=stored.gender)
     if stored.poses.shape[1] != J:
         raise StorageError(f"{path}: expected frames of the model's {J} parts, found {stored.poses.shape[1]} parts; "
                            "a motion of another skeleton comes as BVH")
@@ -133,7 +136,7 @@ def _onto(path: Path, moving: MovingSkeleton, model: BodyModel, subject: Subject
           gender: str = "neutral") -> BodyMotion:
     """Retarget a motion of another skeleton to a body, by default the mean person's."""
     subject = subject or model.subject(np.zeros(1) if model.n_betas else None)
-    skeleton = replace(subject.skeleton, joints=subject.joints(np.zeros((len(subject.skeleton.parents), 3))))
+    skeleton = subject.rest_skeleton
     same = copy_motion(skeleton, subject.template, subject.vertices, moving)
     if same is not None:
         return BodyMotion(same.poses, same.trans, subject.betas, same.rate, gender,

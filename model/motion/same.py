@@ -12,6 +12,19 @@ from ..rig import joint_places, turn_up
 from .moving import MovingSkeleton
 from .retarget import Retargeted, Vertices, lift
 
+# degrees between bones in one rest pose: of twelve synthetic people up to 16, those of A-poses and T-poses 40 and more
+FARTHEST = 25
+
+
+def same_skeleton(skeleton: Skeleton, other: Skeleton) -> bool:
+    """Tell whether two skeletons have the same parts in the same order and rest pose, of different people or of one."""
+    if skeleton.names != other.names or not np.array_equal(skeleton.parents, other.parents):
+        return False
+    bones = np.stack([one.joints[1:] - one.joints[one.parents[1:]] for one in (skeleton, other)])
+    sizes = np.linalg.norm(bones, axis=2).prod(axis=0)
+    cosine = (bones[0] * bones[1]).sum(axis=1)
+    return bool((cosine >= np.cos(np.radians(FARTHEST)) * sizes).all())
+
 
 def copy_motion(skeleton: Skeleton, rest: Mesh, vertices: Vertices, moving: MovingSkeleton) -> Retargeted | None:
     """Copy a motion of the same parts with the same rest pose in other axes; None for another skeleton.
@@ -36,9 +49,10 @@ def copy_motion(skeleton: Skeleton, rest: Mesh, vertices: Vertices, moving: Movi
     if not kept.any():
         return None
     cosine = np.einsum("na,kab,nb->kn", theirs[kept], turns, ours[kept]) / sizes[kept]
-    off = np.degrees(np.arccos(np.clip(cosine, -1, 1))).mean(axis=1)
+    angles = np.degrees(np.arccos(np.clip(cosine, -1, 1)))
+    off = angles.mean(axis=1)
     best = int(np.flatnonzero(off < off.min() + 1e-3)[0])
-    if off[best] >= 10:                         # degrees: the rest poses differ
+    if off[best] >= 10 or angles[best].max() >= FARTHEST:             # degrees: the rest poses differ
         return None
     Q = turns[best]
     scale = np.linalg.norm(ours, axis=1).sum() / np.linalg.norm(theirs, axis=1).sum()

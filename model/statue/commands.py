@@ -18,6 +18,7 @@ from scanprep.cli import MM, Output, PersonUnit, ScanArg
 from scanprep.console import Metric, Outcome, bar, judgement_of, judgement_row, write_report
 from scanprep.folders import FolderCommand, do_one, figure
 from scanprep.geometry.files import write_mesh
+from scanprep.geometry.format_common import metres_of
 from scanprep.geometry.mesh import Mesh
 from scanprep.judgement import NAMED, Judgement, implausible_body
 from scanprep.pictures.gltf import write_animated_glb
@@ -31,6 +32,7 @@ from scanprep.skeleton.roles import in_words
 from scanprep.surfaces.cloud import read_sound_surface
 
 from ..cli import read_body
+from ..export.names import Names
 from ..files import load_model
 from ..motion.onto import read_motion
 from .cli import LevelArg, MotionArg, StatueArg
@@ -53,6 +55,7 @@ from .files import BODY, body_model, load_statue, save_statue, write_body, write
 from .fit import FittedStatue, StatueConfig, fit_statue
 from .motion.motions import follower_of, read_statue_motion, write_body_motion
 from .outer import keep_outer
+from .own_mesh import OWN_MESH, animate_own_mesh, write_own_mesh
 from .registration.automatic import person_unit
 from .registration.clicks import read_features
 from .report import in_motion, motion_pictures, parts_without_data, statue_page, statue_picture
@@ -62,8 +65,8 @@ FINE = StatueConfig(displacement=DisplacementConfig(size=2048))
 
 
 def fit(scan: ScanArg, output: Output, features: Path | None = None, control: Path | None = None,
-        unit: PersonUnit | None = None, config: StatueConfig = FINE, workers: Workers = Workers(), *,
-        space: Workspace) -> Outcome:
+        unit: PersonUnit | None = None, own_mesh: bool = False, names: Names | None = None,
+        config: StatueConfig = FINE, workers: Workers = Workers(), *, space: Workspace) -> Outcome:
     """A scan of one person becomes a statue: a control model that moves, with the detail of the scan as an image.
 
     A person who stands upright is found by itself. For other poses and other bodies, name joint centres and points of
@@ -79,9 +82,14 @@ def fit(scan: ScanArg, output: Output, features: Path | None = None, control: Pa
         control: Control model of your own: a skinned GLB, or control.npz of another statue; else the generic humanoid.
         unit: Unit of the scan and the features; "unknown": it is found together with the person. Else metres with
             --features, and without them that in which the body would be as tall as a person.
+        own_mesh: Write own.glb too: the file's own vertices, materials and textures on the skeleton.
+        names: Whose names the bones of own.glb have: mixamo, unity, unreal, vrm, h-anim or opensim.
         workers: Who fits the scans of a folder.
     """
-    work = Work(humanoid() if control is None else read_control(control), config, unit)
+    if names and not own_mesh:
+        raise UsageError("--names: expected --own-mesh with it; statue.glb has our names, scape statue animate gives it "
+                         "others")
+    work = Work(humanoid() if control is None else read_control(control), config, unit, own_mesh, names)
     if not scan.is_dir():
         if features is None and control is not None:
             raise UsageError("--control: expected --features with the joints of that control model; only the generic "
@@ -107,13 +115,15 @@ class Work:
     control: ControlModel
     config: StatueConfig
     unit: str | None = None                                       # of scans and features, where files cannot tell
+    own_mesh: bool = False                                        # whether own.glb is written
+    names: Names | None = None                                    # of its bones
     command: str = field(default="", metadata={"digest": False})  # for the report of each scan of a folder
 
     def __call__(self, inputs: ScanTask, context: TaskContext) -> list[Metric]:
         """Fit the statue of some files into the folder of a room; the figures."""
         start = time.perf_counter()
         unit = resolve_unit(inputs.scan, self.unit)
-        scan, texture, rows, doubts = read_scan(inputs, unit)
+        scan, texture, rows, doubts, metres = read_scan(inputs, unit)
         joints = points = None
         if inputs.landmarks is not None:
             joints, points = read_features(inputs.landmarks, self.control, scan, unit)
@@ -124,6 +134,8 @@ class Work:
                 statue.control, statue.map, scan_look(texture or scan)))
             statue = replace(statue, texture=image)
         metrics = write_statue(context.folder, inputs.scan.name, scan, statue, rows, doubts)
+        if self.own_mesh:
+            metrics += write_own_mesh(context.folder / OWN_MESH, inputs.scan, metres, statue, self.names)
         if self.command:
             write_report(Outcome(context.folder, metrics, {"statue": self.config}, judgement=judgement_of(metrics)),
                          self.command, time.perf_counter() - start)
@@ -219,8 +231,9 @@ def judge_statue(statue: FittedStatue, scan: Mesh, finest: Level, left_out: Sequ
     return found.merge(implausible_body(float(np.ptp(scan.vertices[:, statue.upright_axis]))))
 
 
-def read_scan(inputs: ScanTask, unit: str | None) -> tuple[Mesh, Texture | None, list[Metric], list[str]]:
-    """Read the body of a scan and its texture in metres, with figures and doubts of the cleaning.
+def read_scan(inputs: ScanTask, unit: str | None
+              ) -> tuple[Mesh, Texture | None, list[Metric], list[str], float]:
+    """Read the body of a scan and its texture in metres, with figures, doubts of the cleaning, and metres a unit.
 
     Without a unit it is metres where features are given, which may be on anything, else that of a person, and
     where no unit gives a person's size it is brought to 1.7 m.
@@ -228,6 +241,9 @@ def read_scan(inputs: ScanTask, unit: str | None) -> tuple[Mesh, Texture | None,
     sought = unit is None and inputs.landmarks is None
     unit = "m" if sought else unit
     scan, texture = read_sound_surface(inputs.scan, unit), read_texture(inputs.scan, unit)
+    # without a unit the reader may have guessed it
+    per_unit = metres_of(unit) if unit else float(
+        np.ptp(scan.vertices) / np.ptp(read_sound_surface(inputs.scan, "m").vertices))
     rows = [Metric("scan, triangles", len(scan.faces))]
     scan, inside = keep_outer(scan)
     if inside:
@@ -243,7 +259,7 @@ def read_scan(inputs: ScanTask, unit: str | None) -> tuple[Mesh, Texture | None,
     left = 1 - float(cleaned.kept.mean())
     if left > 0:
         rows.append(Metric("left out as floor, furniture, specks", 100 * left, "% of the points"))
-    return body, texture and texture.scale_by(metre), rows, doubts
+    return body, texture and texture.scale_by(metre), rows, doubts, per_unit * metre
 
 
 def reconstruct(statue: StatueArg, output: Output, level: LevelArg = 3, tolerance: Positive | None = None,
@@ -279,26 +295,31 @@ def reconstruct(statue: StatueArg, output: Output, level: LevelArg = 3, toleranc
 
 
 def animate(statue: StatueArg, motion: MotionArg, output: Output, model: Path | None = None,
-            registered: Path | None = None, rate: Positive | None = None, level: LevelArg = 2, meshes: bool = False
-            ) -> Outcome:
+            registered: Path | None = None, rate: Positive | None = None, level: LevelArg = 2, meshes: bool = False,
+            own_mesh: bool = False, names: Names | None = None) -> Outcome:
     """A statue in motion: its skeleton moves the control mesh, the detail stands on the moving normals.
 
-    The motion is BVH; or .npz of the synthetic people, or of the statue's own body.npz, as scape animate writes it from
-    markers. With --model the control mesh follows a learned model instead of plain skinning, with all that the model
+    The motion is BVH, motion.npz of any of our commands, AMASS, or a table of key poses (keys.csv). Parts are matched
+    by their names, and rest poses may differ. With --model the control mesh follows a learned model instead of plain skinning, with all that the model
     knows of how skin moves; the motion is then one of that model.
 
     Example: scape statue animate statue walk.bvh -o walking
 
     Args:
         statue: Folder of scape statue fit.
-        motion: .bvh, or .npz with poses, trans and mocap_frame_rate.
+        motion: .bvh, .npz with poses, trans and mocap_frame_rate, or .csv with time and PART_rx, PART_ry, PART_rz in
+            degrees.
         output: Folder to write: statue.glb, motion.npz with its model body.npz, motion.gif, and meshes on demand.
         model: Learned model (.npz) that the control mesh follows.
         registered: The model's template on the scan, in its triangles; else it is brought there.
         rate: Frames a second, where the motion's file does not say or says it wrongly.
         level: Level of detail of the files.
         meshes: Write the exact mesh of every frame.
+        own_mesh: Write own.glb too, the mesh of the scan's file in motion; the statue is one of fit --own-mesh.
+        names: Whose names the bones have: mixamo, unity, unreal, vrm, h-anim or opensim.
     """
+    if model is not None and (own_mesh or names):
+        raise UsageError(f"--{'own-mesh' if own_mesh else 'names'}: a learned model moves no bones; leave out --model")
     loaded = load_statue(statue)
     control, up = loaded.control, loaded.upright_axis
     fine = subdivide_uniform(control.mesh, control.chart, level)
@@ -307,11 +328,13 @@ def animate(statue: StatueArg, motion: MotionArg, output: Output, model: Path | 
     if model is None:
         if registered is not None:
             raise UsageError("--registered: expected --model with it")
-        moved = read_statue_motion(loaded, motion, rate)
+        moved, doubts = read_statue_motion(loaded, motion, rate)
         bodies, frame_rate = control.rig.vertices(moved.poses, moved.trans), moved.rate
         output.mkdir(parents=True, exist_ok=True)
         write_statue_glb(output / "statue.glb", control, detailed(control.mesh.vertices), fine, loaded.texture,
-                         motion=moved, up=up)
+                         motion=moved, up=up, names=names)
+        if own_mesh:
+            animate_own_mesh(output / OWN_MESH, statue / OWN_MESH, loaded, moved, names)
         write_body_motion(output / "motion.npz", control, moved)
         body_model(control).save(output / BODY)                  # the model of the motion, to look at it by itself
         rows = [Metric("joints that follow the motion", len(moved.matched)),

@@ -16,6 +16,7 @@ from scanprep.synthetic import people
 
 from ..blend_weights import strongest
 from ..export.glb import Material, write_skinned_glb
+from ..export.names import Names, rename_bones
 from ..features import linear_features
 from ..motion.retarget import Retargeted
 from ..rig import Rig, turn_up
@@ -167,7 +168,7 @@ def write_for_programs(folder: Path, statue: Statue, vertices: np.ndarray, fine:
 def write_statue_glb(path: str | Path, control: ControlModel, vertices: np.ndarray | None = None,
                      subdivision: Subdivision | None = None, texture: np.ndarray | None = None,
                      normals: np.ndarray | None = None, heights: np.ndarray | None = None,
-                     motion: Retargeted | None = None, up: int = 2) -> None:
+                     motion: Retargeted | None = None, up: int = 2, names: Names | None = None) -> None:
     """Write a statue for any glTF 2.0 viewer, animation program or game engine; the axis `up` points up.
 
     glTF knows linear blend skinning only: joints carry the detailed vertices themselves, while `Reconstruction` moves
@@ -189,6 +190,7 @@ def write_statue_glb(path: str | Path, control: ControlModel, vertices: np.ndarr
     tangents = None if normals is None else chart_tangents(mesh, chart)
     material = Material(chart.uv, mesh.vertex_normals[row], tangents, texture, normals, heights)
     rig = Rig(split, control.skeleton, strongest(weights)[row], np.zeros((0, *split.vertices.shape)))
+    rig = rig if names is None else rename_bones(rig, names)
     poses, trans, rate = (None, None, 1.0) if motion is None else (motion.poses, motion.trans, motion.rate)
     write_skinned_glb(path, rig, poses, trans, rate, up=up, material=material)
 

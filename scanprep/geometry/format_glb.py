@@ -47,11 +47,20 @@ def read(path: Path, data: bytes) -> Contents:
 
 def read_gltf(path: Path, data: bytes) -> Contents:
     """Read a `.gltf` file as `read` does: JSON, with buffers inside or in files beside it."""
-    tree = storage.parse_json(path, data, "a glTF file", MeshFileError)
+    tree, binary = read_tree(path, data)
     with storage.taking_apart(path, "a whole glTF file", MeshFileError), np.errstate(all="ignore"):
+        return _scene(path, tree, binary)
+
+
+def read_tree(path: Path, data: bytes) -> tuple[dict[str, Any], bytes]:
+    """Return the JSON tree of a `.glb` or `.gltf` file and its one buffer, with what lies in files beside it."""
+    if path.suffix.lower() != ".gltf":
+        return chunks_of(path, data)
+    tree = storage.parse_json(path, data, "a glTF file", MeshFileError)
+    with storage.taking_apart(path, "a whole glTF file", MeshFileError):
         if not str(tree["asset"]["version"]).startswith("2"):
             raise MeshFileError(f"{path}: expected glTF version 2, found version {tree['asset']['version']}")
-        return _scene(path, tree, _one_buffer(path, tree, b""))
+        return tree, _one_buffer(path, tree, b"")
 
 
 def _one_buffer(path: Path, tree: dict[str, Any], binary: bytes) -> bytes:
@@ -105,13 +114,13 @@ def _scene(path: Path, tree: dict[str, Any], binary: bytes) -> Contents:
         name = node.get("name") or item(tree["meshes"], node["mesh"]).get("name") or f"node {number}"
         joints = joint_matrices(tree, binary, item(tree["skins"], node["skin"]), places) if "skin" in node else None
         # every instance of the node's mesh, every primitive; skinned vertices by their joints, others by the matrix
-        for instance in _instances(tree, binary, node, matrix):
+        for instance in instances_of(tree, binary, node, matrix):
             before = len(faces)
             placed: dict[tuple[int, Any], int] = {}                # primitives may share their vertices
             for primitive in tree["meshes"][node["mesh"]]["primitives"]:
                 if primitive.get("mode", 4) not in shown:
                     continue
-                primitive, own, data = _unpack(path, tree, binary, primitive)
+                primitive, own, data = decode_primitive(path, tree, binary, primitive)
                 points = primitive["attributes"]["POSITION"], primitive["attributes"].get("JOINTS_0")
                 local = accessor(own, data, points[0], "VEC3").astype(np.float64)
                 if own is not tree or points not in placed:
@@ -140,7 +149,7 @@ def _scene(path: Path, tree: dict[str, Any], binary: bytes) -> Contents:
                     np.concatenate(shades) if len(shades) == len(colors) else None, tuple(objects))
 
 
-def _instances(tree: dict[str, Any], binary: bytes, node: dict[str, Any], matrix: np.ndarray) -> list[np.ndarray]:
+def instances_of(tree: dict[str, Any], binary: bytes, node: dict[str, Any], matrix: np.ndarray) -> list[np.ndarray]:
     """Return the matrices (4, 4) of all instances of a node's mesh: one, or those of EXT_mesh_gpu_instancing."""
     instancing = node.get("extensions", {}).get(_INSTANCES)
     if instancing is None:
@@ -152,8 +161,8 @@ def _instances(tree: dict[str, Any], binary: bytes, node: dict[str, Any], matrix
     return [matrix @ _matrix({key: values[i] for key, values in rows.items()}) for i in range(count)]
 
 
-def _unpack(path: Path, tree: dict[str, Any], binary: bytes, primitive: dict[str, Any]
-              ) -> tuple[dict[str, Any], dict[str, Any], bytes]:
+def decode_primitive(path: Path, tree: dict[str, Any], binary: bytes, primitive: dict[str, Any]
+                     ) -> tuple[dict[str, Any], dict[str, Any], bytes]:
     """Return a primitive with its tree and buffer; a Draco-compressed one is decoded into its own tree and buffer."""
     packed = primitive.get("extensions", {}).get(_DRACO)
     if packed is None or "bufferView" in item(tree["accessors"], primitive["attributes"]["POSITION"]):
@@ -165,10 +174,9 @@ def _unpack(path: Path, tree: dict[str, Any], binary: bytes, primitive: dict[str
     glb.add_indices(np.asarray(mesh.faces))
     attributes = {}
     for name, identity in packed["attributes"].items():
-        if name == "POSITION" or name.startswith(("COLOR_", "JOINTS_", "WEIGHTS_")):
-            values = np.asarray(mesh.get_attribute_by_unique_id(identity)["data"])
-            entry = item(tree["accessors"], primitive["attributes"][name])
-            attributes[name] = glb.add_raw(values, entry["type"], entry.get("normalized", False))
+        values = np.asarray(mesh.get_attribute_by_unique_id(identity)["data"])
+        entry = item(tree["accessors"], primitive["attributes"][name])
+        attributes[name] = glb.add_raw(values, entry["type"], entry.get("normalized", False))
     return {"attributes": attributes, "indices": 0}, *glb.parts()
 
 
@@ -392,10 +400,11 @@ def one_mesh(mesh: dict[str, Any], material: dict[str, Any], node: dict[str, Any
 class Glb:
     """Collects arrays into the one buffer of a binary glTF file."""
 
-    def __init__(self) -> None:
-        self._data = bytearray()
-        self._views: list[dict[str, Any]] = []
-        self._accessors: list[dict[str, Any]] = []
+    def __init__(self, tree: dict[str, Any] | None = None, binary: bytes = b"") -> None:
+        """Begin empty, or with all arrays of a file: its tree and the one buffer of `read_tree`."""
+        self._data = bytearray(binary + b"\0" * (-len(binary) % 4))
+        self._views: list[dict[str, Any]] = list((tree or {}).get("bufferViews", []))
+        self._accessors: list[dict[str, Any]] = list((tree or {}).get("accessors", []))
 
     def add(self, array: np.ndarray, kind: str, target: int | None, bounds: bool = False) -> int:
         """Add float32 numbers, one `kind` per row (a MAT4 by columns); return the index of the accessor.
@@ -467,10 +476,10 @@ class Glb:
 
     def pack(self, document: dict[str, Any], up: int) -> bytes:
         """Encode the file: header, JSON, buffer. Its vertices have been rotated by `turn_up(up)`."""
-        asset = {"version": "2.0", "generator": GENERATOR, "extras": {"up": "xyz"[up]}}
-        document = {"asset": asset, **document,
-                    "buffers": [{"byteLength": len(self._data)}], "bufferViews": self._views,
-                    "accessors": self._accessors}
+        asset = {**document.get("asset", {}), "version": "2.0", "generator": GENERATOR, "extras": {"up": "xyz"[up]}}
+        document = {"asset": {}, **document} | {
+            "asset": asset, "buffers": [{"byteLength": len(self._data)}], "bufferViews": self._views,
+            "accessors": self._accessors}
         text = json.dumps(document, separators=(",", ":")).encode()
         # both chunks are padded to multiples of four bytes
         text += b" " * (-len(text) % 4)

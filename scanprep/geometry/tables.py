@@ -122,3 +122,20 @@ def decode_text(data: bytes) -> str:
         with contextlib.suppress(UnicodeDecodeError):
             return data.decode(encoding)
     return data.decode("latin-1")
+
+
+def table_numbers(path: Path, rows: Sequence[tuple[int, list[str]]], width: int, separator: str, fill: bool = False,
+                  error: type[StorageError] = StorageError) -> np.ndarray:
+    """Read numbers (T, width) from the lines of `table_rows`, NaN for an empty cell.
+
+    With `fill` lines may be short, and are filled up with NaN. An `error` names the line that has other than numbers.
+    """
+    table = np.full((len(rows), width), np.nan)
+    for place, (number, cells) in zip(table, rows, strict=True):
+        if len(cells) > width or (len(cells) < width and not fill):
+            raise error(f"{path}: line {number}: expected {width} values, found {len(cells)}")
+        try:
+            place[:len(cells)] = number_cells(cells, separator != ",")
+        except ValueError as problem:
+            raise error(f"{path}: line {number}: expected numbers, {problem}") from None
+    return table

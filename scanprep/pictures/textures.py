@@ -7,7 +7,7 @@ import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
@@ -90,15 +90,8 @@ def read_texture(path: str | Path, unit: str | None = None) -> Texture | None:
     word = {".obj": b"mtllib", ".glb": b'"images"'}.get(path.suffix.lower())
     if word is None or word not in load_bytes(path):
         return None
-    import trimesh
-
-    resolver = _beside(path)
-    try:
-        with open(path, "rb") as file:
-            loaded = trimesh.load_mesh(file, file_type=path.suffix[1:].lower(), resolver=resolver, process=False)
-    except Exception as error:           # trimesh passes on any error of its readers
-        raise ValueError(f"{path}: expected a mesh with a texture, cannot read it ({error})") from None
-    problems = "; ".join(resolver.problems.values())
+    loaded, found = load_with_materials(path, "load_mesh")
+    problems = "; ".join(found.values())
     visual = loaded.visual
     # the picture is in one of two attributes, by kind of material
     pictures = (getattr(getattr(visual, "material", None), name, None) for name in ("image", "baseColorTexture"))
@@ -119,6 +112,23 @@ def read_texture(path: str | Path, unit: str | None = None) -> Texture | None:
         vertices = vertices @ turn_up(up_of(chunks_of(path, load_bytes(path))[0]))
     mesh = Mesh(vertices, np.asarray(loaded.faces))
     return Texture(mesh, np.asarray(uv, dtype=np.float64), image)
+
+
+def load_with_materials(path: Path, function: Literal["load_mesh", "load_scene"]) -> tuple[Any, dict[str, str]]:
+    """Read an OBJ or GLB with a function of trimesh; also say why pictures beside it cannot be read, by name.
+
+    ValueError where the file cannot be read.
+    """
+    import trimesh
+
+    resolver = _beside(path)
+    try:
+        with open(path, "rb") as file:
+            loaded = getattr(trimesh, function)(file, file_type=path.suffix[1:].lower(), resolver=resolver,
+                                                process=False)
+    except Exception as error:           # trimesh passes on any error of its readers
+        raise ValueError(f"{path}: expected a mesh with a texture, cannot read it ({error})") from None
+    return loaded, resolver.problems
 
 
 def _beside(path: Path) -> Any:

@@ -11,6 +11,7 @@ from model.body import BodyModel
 from model.linear import Subject
 from model.motion.error import LEAN, MOST, RetargetingError
 from model.motion.files import is_motion as holds_poses
+from model.motion.keys import holds_keys, judge_keys, read_keys
 from model.motion.onto import BodyMotion, read_motion
 from scanprep.batch.room import TaskContext
 from scanprep.cli import MM
@@ -22,7 +23,6 @@ from scanprep.pictures.page import Page
 from ...motion import Motion
 from ...motion_pictures import chart_residuals, frame_panes, moving_pane, pane_with_dots, worst_frames
 from ..files.motion_files import write_glb, write_motion_folder, write_residuals
-from .keys import holds_keys, judge_keys, read_keys
 
 ENDINGS = (".bvh", ".npz")
 MEAN_DISTANCE = "distance of joint centres, mean"
@@ -50,7 +50,7 @@ def bring(path: Path, model: BodyModel, name: str, subject: Subject | None, unit
     # keys, or a motion of another skeleton; without a subject a motion may have betas of its own
     if holds_keys(path):
         body = subject if subject is not None else model.subject(np.zeros(1) if model.n_betas else None)
-        source = read_keys(path, body, unit, rate)
+        source = read_keys(path, body.skeleton, body.betas, unit, rate)
         judgement = judge_keys(source.poses)
     else:
         source = read_motion(path, model, subject, unit, rate)

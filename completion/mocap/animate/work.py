@@ -9,6 +9,7 @@ import numpy as np
 
 from model.body import BodyModel
 from model.linear import Subject
+from model.motion.files import skeleton_arrays
 from model.people import person_judgement
 from scanprep.arguments import UsageError
 from scanprep.batch.room import TaskContext
@@ -77,7 +78,7 @@ class AnimateTask:
             if names_motion(path) else self._follow(path, context)
         if self.retarget_to is not None:
             other = retarget(motion, body, self.retarget_to)
-            other.save(context.folder / "onto.npz")
+            other.save(context.folder / "onto.npz", **skeleton_arrays(self.retarget_to.rest_skeleton))
             metrics += write_glb(context.folder / "onto.glb", other, self.retarget_to)
             page.section("On another person", "The same rotations of the joints; the way over the ground is as much "
                          "longer as the legs are, and the feet are on the ground when those of the first are.")

@@ -12,6 +12,7 @@ from model.export.conventions import aim_bones
 from model.export.correctives import body_correctives, motion_correctives, off_exact
 from model.export.glb import write_skinned_glb
 from model.linear import Subject
+from model.motion.files import skeleton_arrays
 from model.rig import subject_rig
 from scanprep.console import Metric, details
 from scanprep.geometry import storage, tables
@@ -98,7 +99,7 @@ def write_motion_folder(folder: Path, motion: Motion, subject: Subject, markers:
     names, angles = skeleton.names, joint_angles(motion)
     if (told := known.told) is not None:
         angles[~(told & told[:, np.maximum(skeleton.parents, 0)])] = np.nan     # unknown if either side is
-    motion.save(folder / "motion.npz")
+    motion.save(folder / "motion.npz", **skeleton_arrays(subject.rest_skeleton))
     write_motion_bvh(folder / "motion.bvh", motion, subject)
     write_numbers(folder / "joint_angles.csv", ["time", *(f"{name}_r{axis}" for name in names for axis in "xyz")],
                   np.c_[motion.times, angles.reshape(T, -1)])
@@ -120,8 +121,7 @@ def write_residuals(path: Path, motion: Motion) -> None:
 def write_motion_bvh(path: Path, motion: Motion, subject: Subject) -> None:
     """Write a BVH in centimetres: the bones of the subject at rest, and the motion."""
     rest = subject.vertices(np.zeros((len(subject.skeleton.parents), 3)))
-    skeleton = replace(subject.skeleton, joints=subject.joints(np.zeros((len(subject.skeleton.parents), 3))))
-    write_bvh(path, skeleton, motion.poses, motion.trans, motion.rate, up=guess_upright(subject.template)[0],
+    write_bvh(path, subject.rest_skeleton, motion.poses, motion.trans, motion.rate, up=guess_upright(subject.template)[0],
               body=subject.template.with_vertices(rest))
 
 

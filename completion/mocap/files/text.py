@@ -9,6 +9,7 @@ import re
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -186,17 +187,7 @@ def csv_markers(path: Path, separator: str, rows: Rows) -> RawMarkers:
     return RawMarkers(table[:, places].reshape(len(table), len(labels), 3), labels, rate, "m", notes)
 
 
-def table_numbers(path: Path, rows: Rows, width: int, separator: str, fill: bool = False) -> np.ndarray:
-    """Read numbers (T, width) from lines, NaN for an empty cell and, with `fill`, beyond the end of a short line."""
-    table = np.full((len(rows), width), np.nan)
-    for place, (number, cells) in zip(table, rows, strict=True):
-        if len(cells) > width or (len(cells) < width and not fill):
-            raise MarkerFileError(f"{path}: line {number}: expected {width} values, found {len(cells)}")
-        try:
-            place[:len(cells)] = tables.number_cells(cells, separator != ",")
-        except ValueError as error:
-            raise MarkerFileError(f"{path}: line {number}: expected numbers, {error}") from None
-    return table
+table_numbers = partial(tables.table_numbers, error=MarkerFileError)
 
 
 def even_rate(times: np.ndarray) -> float | None:

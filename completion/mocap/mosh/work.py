@@ -14,6 +14,7 @@ import numpy as np
 from model.body import BodyModel
 from model.learning.sexes import SexGuess
 from model.linear import Subject
+from model.motion.files import skeleton_arrays
 from model.people import person_judgement
 from scanprep.arguments import UsageError
 from scanprep.batch.room import TaskContext
@@ -375,7 +376,7 @@ def _character(character: BodyModel, take: Take, folder: Path, factor: float) ->
                 "the person, the character, and how far the character's skin is stretched or squeezed", told)
     body = character.subject(np.zeros(character.n_betas))
     motion = retarget(take.motion, take.subject, body)
-    motion.save(folder / "character.npz")
+    motion.save(folder / "character.npz", **skeleton_arrays(body.rest_skeleton))
     told = write_glb(folder / "character.glb", motion, body)
     frames = spread_indices(len(motion.poses), 8)
     return picture_bodies(motion, body, motion.vertices(body, frames), frames), "", told

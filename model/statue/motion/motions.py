@@ -23,35 +23,53 @@ from ...fitting.vertices import fit_shape
 from ...linear import Subject
 from ...motion.amass import moving_body
 from ...motion.bvh import read_bvh
-from ...motion.files import StoredMotion, read_motion_file
-from ...motion.moving import MovingSkeleton
+from ...motion.files import StoredMotion, read_motion_file, skeleton_arrays
+from ...motion.keys import holds_keys, judge_keys, read_keys
+from ...motion.moving import MovingSkeleton, set_in_motion
 from ...motion.retarget import Pairing, Retargeted, retarget_pair
 from ...motion.same import copy_motion
-from ...rig import check_motion, joint_places
+from ...rig import check_motion
 from ..control.model import ControlModel, Statue
 from ..detail.reconstruction import Reconstruction
 from ..detail.subdivision import subdivide_uniform
 
 
-def read_statue_motion(statue: Statue, path: Path, rate: float | None = None) -> Retargeted:
-    """Read a motion for a statue: BVH, AMASS, or `.npz` of its own parts or of the synthetic people.
+def read_statue_motion(statue: Statue, path: Path, rate: float | None = None) -> tuple[Retargeted, list[str]]:
+    """Read a motion for a statue, with doubts: BVH, AMASS, keys in a table, or `.npz` of ours.
 
+    A motion that holds its skeleton is copied where parts and rest pose are those of the statue, else retargeted.
     `rate` is frames a second, where the file does not say or says it wrongly.
     """
-    control, people = statue.control, 16
+    control, parts = statue.control, statue.control.skeleton
+    if holds_keys(path):
+        keys = read_keys(path, parts, rate=rate)
+        every = dict(zip(parts.names, parts.names, strict=True))
+        return Retargeted(keys.poses, keys.trans, keys.rate, every), [*judge_keys(keys.poses).reasons]
     if path.suffix.lower() == ".bvh":
         # the unit does not matter, since travel is scaled by the legs
-        return _with_file_name(path, bvh_motion, control, statue.pose, read_bvh(path, "cm", rate))
+        return _with_file_name(path, bvh_motion, control, statue.pose, read_bvh(path, "cm", rate)), []
     stored = read_motion_file(path, rate=rate)
-    count, own = stored.poses.shape[1], len(control.skeleton.parents)
-    if count == own:
-        return _own(control, path, stored)
+    if stored.skeleton is not None:
+        same = stored.skeleton.names == parts.names and np.array_equal(stored.skeleton.parents, parts.parents)
+        if same and np.abs(stored.skeleton.joints - parts.joints).max() < 0.001:      # metres: made for this statue
+            return _own(control, path, stored), []
+        moving = set_in_motion(stored.skeleton, stored.poses, stored.trans, stored.rate)
+        return _with_file_name(path, bvh_motion, control, statue.pose, moving), []
     if stored.of_family:
-        return _with_file_name(path, bvh_motion, control, statue.pose, moving_body(stored)[0])
-    if count != people:
-        raise StorageError(f"{path}: expected the {own} parts of the statue or the {people} of the synthetic people, "
-                           f"found {count}; for a motion of a learned model name it with --model")
-    return people_motion(control, statue.pose, stored.poses, stored.trans, stored.rate)
+        return _with_file_name(path, bvh_motion, control, statue.pose, moving_body(stored)[0]), []
+    # files of older versions and of other programs do not hold their skeleton: only the kind and the count say whose
+    # they are
+    count, own, people = stored.poses.shape[1], len(parts.parents), 16
+    again = "make the file again (scape animate, scape demo), or bring BVH; for a learned model name it with --model"
+    if stored.made_for == "scape" or count not in (own, people):
+        raise StorageError(f"{path}: it does not say which skeleton its {count} parts are of, and the statue has {own}; "
+                           f"{again}")
+    doubt = f"{path.name} does not say which skeleton it is of, and was taken for {{}} by its {count} parts; {again}"
+    if count == own:
+        whose = [] if stored.made_for == "skinning" else [doubt.format("a motion of the statue")]
+        return _own(control, path, stored), whose
+    return (people_motion(control, statue.pose, stored.poses, stored.trans, stored.rate),
+            [doubt.format("one of the synthetic people")])
 
 
 def _with_file_name(path: Path, make: Callable[..., Retargeted], *given: object) -> Retargeted:
@@ -83,7 +101,8 @@ def write_body_motion(path: str | Path, control: ControlModel, motion: Retargete
     """Write a motion as `own_motion` reads it, with the array names that body-model files use."""
     arrays = {"poses": motion.poses.reshape(len(motion.poses), -1),
               "trans": motion.trans + middle_drift(control, motion.poses), "betas": np.zeros(0),
-              "mocap_frame_rate": np.array(float(motion.rate)), "surface_model_type": np.array("skinning")}
+              "mocap_frame_rate": np.array(float(motion.rate)), "surface_model_type": np.array("skinning"),
+              **skeleton_arrays(control.skeleton)}
     save_arrays(path, arrays)
 
 
@@ -102,10 +121,7 @@ def people_motion(control: ControlModel, pose: np.ndarray, poses: np.ndarray, tr
     The generic control model has the same rest pose, so world rotations of the parts are copied.
     """
     skeleton = _average_skeleton()
-    poses, trans = check_motion(skeleton, poses, trans, rate)
-    offsets = skeleton.joints - np.where(skeleton.parents[:, None] < 0, 0, skeleton.joints[skeleton.parents])
-    moving = MovingSkeleton(skeleton.names, skeleton.parents, offsets, {}, skeleton.part_rotations(poses),
-                            joint_places(skeleton, poses, trans), rate)
+    moving = set_in_motion(skeleton, *check_motion(skeleton, poses, trans, rate), rate)
     return retarget_pair(Pairing(control.skeleton, control.rig.vertices, moving, pose), True, girdle, True)
 
 
@@ -143,7 +159,7 @@ class BoundControl:
         if registered is not None and registered.shape != body.vertices.shape:
             raise ValueError(f"registered: expected shape {body.vertices.shape}, got {registered.shape}")
         near = body if registered is None else body.with_vertices(registered)
-        self._bind = _bound(mesh, near)
+        self._bind = bind_points(mesh, near)
         # weights of the edges whose rotation is averaged around each vertex of the body: over four rings
         N, edges = len(body.vertices), body.edges
         ends = sparse.gatherer(edges.T.ravel(), N) @ vstack([eye_array(len(edges))] * 2)
@@ -170,7 +186,7 @@ class BoundControl:
         return np.asarray(self._bind @ body + np.einsum("nab,nb->na", R, self._offset))
 
 
-def _bound(mesh: Mesh, body: Mesh) -> csr_array:
+def bind_points(mesh: Mesh, body: Mesh) -> csr_array:
     """Bind each control vertex to a body point with a compatible normal: barycentric weights (n, N)."""
     close = Surface(body).closest(mesh.vertices)
     corners, weights = body.faces[close.faces].copy(), close.bary.copy()

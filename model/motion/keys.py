@@ -9,14 +9,13 @@ import numpy as np
 from scipy.interpolate import PchipInterpolator
 from scipy.spatial.transform import Rotation
 
-from model.linear import Subject
-from model.motion.onto import BodyMotion
 from scanprep.geometry import storage, tables
 from scanprep.geometry.format_common import UNITS
 from scanprep.judgement import Judgement
 from scanprep.ranges import TURNS
+from scanprep.skeleton.tree import Skeleton
 
-from ..files.text import table_numbers
+from .onto import BodyMotion
 
 
 def holds_keys(path: Path) -> bool:
@@ -28,7 +27,8 @@ def holds_keys(path: Path) -> bool:
     return any(re.fullmatch(".+_r[xyz]", word.strip(' "\r').lower()) for word in re.split("[,;\t]", head))
 
 
-def read_keys(path: Path, subject: Subject, unit: str | None = None, rate: float | None = None) -> BodyMotion:
+def read_keys(path: Path, skeleton: Skeleton, betas: np.ndarray | None = None, unit: str | None = None,
+              rate: float | None = None) -> BodyMotion:
     """Read key poses from a table and interpolate them to a motion.
 
     The columns are `time` in seconds, then `PART_rx, PART_ry, PART_rz` of some parts, their rotation vectors relative
@@ -40,8 +40,10 @@ def read_keys(path: Path, subject: Subject, unit: str | None = None, rate: float
     ----------
     path : Path
         CSV or TSV.
-    subject : Subject
-        The body that moves.
+    skeleton : Skeleton
+        The body's parts.
+    betas : (K,) float, optional
+        Shape of the body that moves.
     unit : str, optional
         Of the trans columns, else metres.
     rate : float, optional
@@ -58,13 +60,13 @@ def read_keys(path: Path, subject: Subject, unit: str | None = None, rate: float
     >>> from model import load_built_in_model
     >>> path = Path(mkdtemp()) / "wave.csv"
     >>> _ = path.write_text("time,upper_arm_right_rx,upper_arm_right_ry,upper_arm_right_rz\\n0,0,0,0\\n1,90,0,0\\n")
-    >>> read_keys(path, load_built_in_model().subject()).poses.shape
+    >>> read_keys(path, load_built_in_model().skeleton).poses.shape
     (31, 16, 3)
 
     [SCAPE-patent] par. 12
     """
     separator, rows = tables.table_rows(path, storage.read_bytes(path, "a table of keys"))
-    head, names = [word.lower() for word in rows[0][1]] if rows else [], subject.skeleton.names
+    head, names = [word.lower() for word in rows[0][1]] if rows else [], skeleton.names
     known = {f"{name}_r{axis}".lower(): (j, k) for j, name in enumerate(names) for k, axis in enumerate("xyz")}
     place = ("trans_x", "trans_y", "trans_z")
     # check the header: known columns, each once, and keys below it
@@ -78,7 +80,7 @@ def read_keys(path: Path, subject: Subject, unit: str | None = None, rate: float
     if not rows[1:]:
         raise storage.StorageError(f"{path}: expected keys below the first line, found none")
     # numbers, with times that increase
-    table = table_numbers(path, rows[1:], len(head), separator, fill=True)
+    table = tables.table_numbers(path, rows[1:], len(head), separator, fill=True)
     lines = [number for number, _ in rows[1:]]
     times = table[:, head.index("time")]
     wrong = np.flatnonzero(~np.isfinite(times) | np.r_[False, ~(np.diff(times) > 0)])
@@ -105,7 +107,7 @@ def read_keys(path: Path, subject: Subject, unit: str | None = None, rate: float
     places = _coordinates(path, table, columns, place, lines)
     keyed = np.isfinite(places[:, 0])
     trans = _between(times[keyed], UNITS[unit or "m"] * places[keyed], at) if keyed.any() else np.zeros((len(at), 3))
-    return BodyMotion(poses, trans, subject.betas, rate, how=f"between {len(times)} keys")
+    return BodyMotion(poses, trans, betas, rate, how=f"between {len(times)} keys")
 
 
 def judge_keys(poses: np.ndarray) -> Judgement:

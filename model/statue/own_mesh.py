@@ -1,0 +1,315 @@
+"""The file's own mesh on the skeleton of its statue: vertices, shells and materials as they came, with blend weights."""
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from scanprep.console import Metric
+from scanprep.geometry import format_glb as glb
+from scanprep.geometry.files import read_mesh
+from scanprep.geometry.format_common import Contents, load_bytes
+from scanprep.geometry.mesh import Mesh
+from scanprep.geometry.storage import StorageError, write_file
+from scanprep.pictures.textures import load_with_materials
+
+from ..blend_weights import strongest
+from ..export.conventions import aim_bones
+from ..export.glb import add_animation, add_skin, build_nodes, four_carriers
+from ..export.names import Names, rename_bones
+from ..motion.retarget import Retargeted
+from ..rig import Rig, turn_up
+from .control.model import Statue
+from .detail.reconstruction import Reconstruction
+from .detail.subdivision import subdivide_uniform
+from .motion.motions import bind_points
+
+OWN_MESH = "own.glb"
+# shares of the figure's height. Welded: vertices that stand closer are one place; seams of files differ by 1e-6.
+# Stiff: the extent up to which a part of its own (eye, button, belt, shoe) keeps its shape; a sleeve has 0.25 and more.
+# Apart: a larger part whose median distance from the body is more (a staff, a shield) keeps its shape too.
+WELDED, STIFF, APART = 1e-5, 0.2, 0.03
+DROPPED = ("KHR_draco_mesh_compression", "EXT_mesh_gpu_instancing")      # extensions whose arrays are written out plain
+
+
+class Piece(NamedTuple):
+    """A primitive of a glTF file where it stands in the scene."""
+
+    primitive: dict[str, Any]
+    tree: dict[str, Any]           # with the accessors of its attributes; its own where it was compressed
+    binary: bytes
+    motion: np.ndarray             # (n, 4, 4) or (1, 4, 4), from its numbers to the scene, metres
+
+    def attribute(self, name: str) -> np.ndarray:
+        """Read an attribute (n, width)."""
+        return glb.accessor(self.tree, self.binary, self.primitive["attributes"][name], "VEC3", "VEC4").astype(float)
+
+    def bend(self, vectors: np.ndarray) -> np.ndarray:
+        """Carry directions (n, 3) along, without the translation."""
+        return np.einsum("nab,nb->na", np.broadcast_to(self.motion[:, :3, :3], (len(vectors), 3, 3)), vectors)
+
+    @property
+    def points(self) -> np.ndarray:
+        """(n, 3) metres, in the scene."""
+        return self.bend(self.attribute("POSITION")) + self.motion[:, :3, 3]
+
+    @property
+    def normals(self) -> np.ndarray:
+        """(n, 3) unit, in the scene: turned by the cofactors, which have no division where a scale is zero."""
+        x, y, z = np.moveaxis(self.motion[:, :3, :3], 1, 0)
+        cofactors = np.stack([np.cross(y, z), np.cross(z, x), np.cross(x, y)], axis=1)
+        return unit(self._replace(motion=(-1.0) ** self.mirrored * cofactors).bend(self.attribute("NORMAL")))
+
+    @property
+    def mirrored(self) -> bool:
+        """Whether its triangles are turned over in the scene."""
+        return bool(np.linalg.det(self.motion[0, :3, :3]) < 0)
+
+    @property
+    def triangles(self) -> np.ndarray:
+        """(F, 3), outward in the scene."""
+        faces = glb.primitive_triangles(self.tree, self.binary, self.primitive, len(self.attribute("POSITION")))
+        return faces[:, ::-1] if self.mirrored else faces
+
+
+def unit(vectors: np.ndarray) -> np.ndarray:
+    """Scale vectors (n, 3) to length 1; zeros point along z, since glTF allows no zero normal."""
+    size = np.linalg.norm(vectors, axis=1, keepdims=True)
+    return np.where(size > 0, vectors / np.maximum(size, 1e-300), [0.0, 0, 1])
+
+
+def write_own_mesh(path: Path, source: Path, metres: float, statue: Statue, names: Names | None = None) -> list[Metric]:
+    """Write the mesh of a scan's file on the skeleton of its statue, with the materials of the file, as GLB.
+
+    Vertices keep their places, times `metres` for a unit of the file. An old skin and old animations are replaced.
+    Every vertex takes the blend weights of the finished surface where that is nearest and faces the same way; see
+    `carry_weights` for what hangs loose.
+
+    Parameters
+    ----------
+    path : Path
+        `.glb` to write.
+    source : Path
+        Any mesh file; of glTF and OBJ the materials are kept.
+    metres : float
+        For a unit of the file.
+    statue : Statue
+        Fitted to that file.
+    names : str, optional
+        Whose names the bones have, as in `rename_bones`.
+
+    Returns
+    -------
+    list of Metric
+        What was written.
+
+    Raises
+    ------
+    ValueError
+        A file without triangles.
+    """
+    # 1. the pieces of the file in the axes of glTF
+    tree, binary = read_as_gltf(source)
+    is_gltf = source.suffix.lower() in (".glb", ".gltf")
+    up = glb.up_of(tree) if is_gltf else statue.upright_axis
+    frame = np.diag([metres] * 3 + [1.0])
+    frame[:3, :3] = metres * turn_up(up) @ turn_up(glb.up_of(tree)).T
+    shapes = place_pieces(source, tree, binary, frame)
+    pieces = [piece for _, own in shapes for piece in own]
+    if not pieces:
+        raise ValueError(f"{source}: expected triangles for --own-mesh, found points only; leave it out")
+    # 2. weights of all vertices, of which those at one place have the same
+    starts = np.cumsum([0, *(len(piece.points) for piece in pieces)])
+    faces = np.concatenate([piece.triangles + start for piece, start in zip(pieces, starts, strict=False)])
+    points = np.concatenate([piece.points for piece in pieces])
+    weights, loose = carry_weights(statue, Mesh(points @ turn_up(up), faces))
+    # 3. meshes with new attributes; the rest of the file stays
+    arrays, rig = glb.Glb(tree, binary), own_rig(statue, names).with_up(up)
+    nodes, meshes, number = build_nodes(rig)[1:], list[dict[str, Any]](), 0
+    for node, own in shapes:
+        primitives = []
+        for piece in own:
+            primitives.append(rewrite(arrays, tree, binary, piece, weights[starts[number]:starts[number + 1]]))
+            number += 1
+        mesh = tree["meshes"][node["mesh"]]
+        meshes.append({**{key: mesh[key] for key in ("name", "weights", "extras") if key in mesh},
+                       "primitives": primitives})
+        nodes.append({**{key: node[key] for key in ("name", "weights", "extras") if key in node},
+                      "mesh": len(meshes) - 1, "skin": 0})
+    # the joints are nodes 1 to J, as `add_skin` numbers them, so the first mesh stands before them
+    J = len(rig.skeleton.parents)
+    nodes = [nodes[J], *nodes[:J], *nodes[J + 1:]]
+    kept = {key: value for key, value in tree.items() if key in (
+        "asset", "materials", "textures", "samplers", "extensions", "extras")}
+    images = [embed_image(arrays, source, image) for image in tree.get("images", [])]
+    needed = {key: [name for name in tree[key] if name not in DROPPED]
+              for key in ("extensionsUsed", "extensionsRequired") if key in tree}
+    document = {**kept, "scene": 0, "scenes": [{"nodes": [0, 1, *range(J + 1, len(nodes))]}], "nodes": nodes,
+                "meshes": meshes, "skins": [add_skin(arrays, rig)], "images": images, **needed}
+    write_file(path, arrays.pack({key: value for key, value in document.items() if value not in ([], {})}, up))
+    return [Metric("own mesh, vertices", len(points)), Metric("own mesh, loose parts that stay stiff", loose),
+            *([Metric("own mesh, morph targets kept", sum(len(p.primitive.get("targets", [])) for p in pieces))]
+              if any("targets" in piece.primitive for piece in pieces) else [])]
+
+
+def animate_own_mesh(path: Path, stored: Path, statue: Statue, motion: Retargeted, names: Names | None = None) -> None:
+    """Write the own mesh of a statue with a motion; StorageError where the statue has none, or that of another fit."""
+    again = "run scape statue fit with --own-mesh again"
+    if not stored.is_file():
+        raise StorageError(f"{stored}: the statue has no mesh of its file; {again}")
+    tree, binary = glb.read_tree(stored, load_bytes(stored))
+    up = glb.up_of(tree)
+    rig, arrays = own_rig(statue, names).with_up(up), glb.Glb(tree, binary)
+    joints = build_nodes(rig)[1:]
+    before = [node.get("translation") for node in tree["nodes"][1:len(joints) + 1]]
+    same = len(before) == len(joints) and None not in before
+    if not same or not np.allclose(before, [node["translation"] for node in joints], atol=1e-6):
+        raise StorageError(f"{stored}: it is of another fit than the rest of the folder; {again}")
+    for node, joint in zip(tree["nodes"][1:], joints, strict=False):
+        node["name"] = joint["name"] if names else node["name"]
+    U = turn_up(up).T
+    tree["animations"] = [add_animation(arrays, rig, motion.poses @ U, motion.trans @ U, motion.rate, 0)]
+    write_file(path, arrays.pack(tree, up))
+
+
+def own_rig(statue: Statue, names: Names | None) -> Rig:
+    """Build the rig of a statue's control mesh with bones along the limbs, under the names of another program."""
+    rig = aim_bones(statue.control.rig, statue.upright_axis)
+    return rig if names is None else rename_bones(rig, names)
+
+
+def read_as_gltf(path: Path) -> tuple[dict[str, Any], bytes]:
+    """Read any mesh file as a glTF tree and its buffer; numbers are those of the file."""
+    if path.suffix.lower() in (".glb", ".gltf"):
+        return glb.read_tree(path, load_bytes(path))
+    if path.suffix.lower() == ".obj":
+        data = load_with_materials(path, "load_scene")[0].export(file_type="glb")
+    else:
+        mesh = read_mesh(path, "m")
+        data = glb.encode(Contents(mesh.vertices, mesh.faces, None, mesh.colors), False)
+    return glb.chunks_of(path, data)
+
+
+def place_pieces(path: Path, tree: dict[str, Any], binary: bytes, frame: np.ndarray
+                 ) -> list[tuple[dict[str, Any], list[Piece]]]:
+    """List the nodes with a mesh, and their primitives of triangles as they stand in the scene, turned by a frame."""
+    nodes = [(number, node, frame @ matrix) for number, node, matrix in glb.nodes_of(tree)]
+    places, out = {number: matrix for number, _, matrix in nodes}, []
+    for _, node, matrix in nodes:
+        if "mesh" not in node:
+            continue
+        joints = (glb.joint_matrices(tree, binary, glb.item(tree["skins"], node["skin"]), places)
+                  if "skin" in node else None)
+        pieces = []
+        for instance in glb.instances_of(tree, binary, node, matrix):
+            for primitive in glb.item(tree["meshes"], node["mesh"])["primitives"]:
+                if primitive.get("mode", 4) not in (4, 5, 6):             # triangles, strips, fans
+                    continue
+                decoded, own, data = glb.decode_primitive(path, tree, binary, primitive)
+                motion = instance[None]
+                if joints is not None and "JOINTS_0" in decoded["attributes"]:
+                    motion = np.einsum("nj,jab->nab", glb.weights_of(own, data, decoded, len(joints)), joints)
+                pieces.append(Piece({**primitive, **decoded}, own, data, motion))
+        out += [(node, pieces)] if pieces else []
+    return out
+
+
+def rewrite(arrays: glb.Glb, tree: dict[str, Any], binary: bytes, piece: Piece, weights: np.ndarray) -> dict[str, Any]:
+    """Add a piece's surface as it stands, with blend weights (n, J); all else of its primitive stays."""
+    primitive, points = piece.primitive, piece.points
+    kept = {name: number for name, number in primitive["attributes"].items() if not name.startswith((
+        "POSITION", "NORMAL", "TANGENT", "JOINTS_", "WEIGHTS_"))}
+    if piece.tree is not tree:                                     # what was compressed is written out plain
+        kinds = {name: piece.tree["accessors"][number]["type"] for name, number in kept.items()}
+        kept = {name: arrays.add(glb.accessor(piece.tree, piece.binary, kept[name], kind), kind, glb.VERTICES)
+                for name, kind in kinds.items()}
+    joints, shares = four_carriers(weights)
+    attributes = {"POSITION": arrays.add(points, "VEC3", glb.VERTICES, bounds=True), **kept,
+                  "JOINTS_0": arrays.add_joints(joints), "WEIGHTS_0": arrays.add(shares, "VEC4", glb.VERTICES)}
+    if "NORMAL" in primitive["attributes"]:
+        attributes["NORMAL"] = arrays.add(piece.normals, "VEC3", glb.VERTICES)
+    if "TANGENT" in primitive["attributes"]:
+        tangents = piece.attribute("TANGENT")
+        handed = (-1.0) ** piece.mirrored * tangents[:, 3]
+        attributes["TANGENT"] = arrays.add(np.column_stack([unit(piece.bend(tangents[:, :3])), handed]), "VEC4",
+                                           glb.VERTICES)
+    out = {key: value for key, value in primitive.items() if key not in ("mode", "targets", "indices")}
+    extensions = {key: value for key, value in primitive.get("extensions", {}).items() if key not in DROPPED}
+    out |= {"attributes": attributes, "indices": arrays.add_indices(piece.triangles), "extensions": extensions}
+    targets = [{name: arrays.add(piece.bend(glb.accessor(tree, binary, number, "VEC3").astype(float)), "VEC3",
+                                 glb.VERTICES, bounds=name == "POSITION")
+                for name, number in target.items() if name in ("POSITION", "NORMAL", "TANGENT")}
+               for target in primitive.get("targets", [])]
+    return {key: value for key, value in {**out, "targets": targets}.items() if value not in ([], {})}
+
+
+def embed_image(arrays: glb.Glb, source: Path, image: dict[str, Any]) -> dict[str, Any]:
+    """Take a picture that lies beside the file into the file; others are returned as they are."""
+    name = str(image.get("uri", "data:"))
+    if name.startswith("data:"):
+        return image
+    kind = "image/png" if name.lower().endswith(".png") else "image/jpeg"
+    added = arrays.add_png(load_bytes(glb.file_beside(source, name)), name)
+    return {**{key: value for key, value in image.items() if key != "uri"}, **added, "mimeType": kind}
+
+
+@dataclass(frozen=True, eq=False)
+class Shells:
+    """The connected parts of a mesh whose vertices are welded by place."""
+
+    mesh: Mesh
+    place: np.ndarray        # (n,), the welded vertex of each vertex of the file
+
+    @staticmethod
+    def of(mesh: Mesh, width: float) -> Shells:
+        """Weld the vertices that are closer than about `width`, metres."""
+        _, first, place = np.unique(np.round(mesh.vertices / width), axis=0, return_index=True, return_inverse=True)
+        place = place.reshape(-1)
+        return Shells(Mesh(mesh.vertices[first], place[mesh.faces]), place)
+
+
+def carry_weights(statue: Statue, mesh: Mesh) -> tuple[np.ndarray, int]:
+    """Carry the blend weights of a statue over to another mesh of the same figure, and count its stiff parts.
+
+    Parts of their own that are small, or lie off the body, have one set of weights: the mean where they are nearest to
+    the body. So eyes, teeth, buttons, belts and staffs keep their shape.
+
+    Parameters
+    ----------
+    statue : Statue
+        Fitted to the figure.
+    mesh : Mesh, metres
+        n vertices in the axes of the statue, which may be repeated along seams.
+
+    Returns
+    -------
+    tuple
+        Weights (n, J), at most four a vertex, and the number of stiff parts.
+    """
+    # the finished surface at 16 triangles for one of the control mesh, about 8 mm long
+    control = statue.control
+    fine = subdivide_uniform(control.mesh, control.chart, 2)
+    body = Reconstruction(control, statue.map, fine).mesh()
+    height = float(np.ptp(body.vertices[:, statue.upright_axis]))
+    shells = Shells.of(mesh, WELDED * height)
+    places, shell = shells.mesh.vertices, shells.mesh.vertex_component
+    bound = bind_points(shells.mesh, body)
+    off = np.linalg.norm(bound @ body.vertices - places, axis=1)
+    weights = bound @ np.einsum("nc,ncj->nj", fine.bary, control.weights[control.mesh.faces[fine.parent]])
+    # extent and median distance of every connected part
+    order = np.lexsort((off, shell))
+    count = np.bincount(shell)
+    start = np.r_[0, np.cumsum(count)[:-1]]
+    sides = places[order]
+    extent = (np.maximum.reduceat(sides, start) - np.minimum.reduceat(sides, start)).max(axis=1)
+    stiff = (extent < STIFF * height) | (off[order][start + count // 2] > APART * height)
+    stiff[np.argmax(extent)] = False
+    # the mean over the tenth of its vertices that is nearest to the body
+    rank = np.arange(len(order)) - start[shell[order]]
+    near = order[rank <= count[shell[order]] // 10]
+    mean = np.zeros((len(count), weights.shape[1]))
+    np.add.at(mean, shell[near], weights[near])
+    weights = np.where(stiff[shell][:, None], (mean / mean.sum(axis=1, keepdims=True))[shell], weights)
+    return strongest(weights)[shells.place], int(stiff.sum())
