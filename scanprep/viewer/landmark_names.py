@@ -1,4 +1,4 @@
-"""Names of landmarks to click: a good ten, the 73 of CAESAR, or those of a file."""
+"""Names of landmarks to click: a good ten, the 73 of CAESAR, joints and points of the face, or those of a file."""
 from __future__ import annotations
 
 from pathlib import Path
@@ -18,6 +18,16 @@ _PAIRED = ("Infraorbitale", "Tragion", "Gonion", "Clavicale", "Thelion/Bustpoint
            "Metatarsal Phal. I", "Metatarsal Phal. V", "Lateral Malleolus", "Medial Malleolus", "Sphyrion",
            "Calcaneous, Post.", "Digit II")
 CAESAR = (*_MIDDLE, *(f"{side} {name}" for name in _PAIRED for side in ("Rt.", "Lt.")))
+
+# points of the surface of a head; joints of the generic humanoid of `scape statue`, and what to aim at for them
+FACE = ("nose tip", "chin", "left eye", "right eye", "left ear", "right ear", "top of head", "mouth")
+HUMANOID = ("l_shoulder", "r_shoulder", "l_elbow", "r_elbow", "l_wrist", "r_wrist", "l_hip", "r_hip", "l_knee", "r_knee",
+            "l_ankle", "r_ankle", "skullbase", "vl5", "l_sternoclavicular", "r_sternoclavicular", *FACE)
+AIMS = {"shoulder": "middle of the rounded end of the shoulder",
+        "hip": "a hand's width above the crotch, half way out, "
+               "and a little nearer to the front than the middle",
+        "skullbase": "middle of the neck, just below the chin", "vl5": "middle of the trunk, just below the navel",
+        "sternoclavicular": "inner end of the collar bone"}
 
 # words that stand for a list on the command line
 LISTS = {"ten": TEN, "caesar": CAESAR}
