@@ -7,6 +7,7 @@ import trimesh
 from browser import wait_until
 
 from scanprep.geometry.files import write_mesh
+from scanprep.geometry.landmark_names import FACE
 from scanprep.geometry.landmarks import read_landmarks, write_landmarks
 from scanprep.geometry.mesh import Mesh
 from scanprep.pipeline import pick
@@ -14,7 +15,7 @@ from scanprep.synthetic.landmarks import landmarks
 from scanprep.synthetic.people import SyntheticPerson
 from scanprep.viewer.clicked import Clicked
 from scanprep.viewer.joints import JointApp
-from scanprep.viewer.landmark_names import FACE, HUMANOID
+from scanprep.viewer.landmark_names import HUMANOID
 from scanprep.viewer.messages import Message
 from scanprep.viewer.server import Server
 from scanprep.viewer.surface_clicks import Clickable
@@ -166,6 +167,6 @@ def test_joints_are_clicked_in_the_browser(new_page, app, true_joints):
         page.locator("input[aria-label=depth]").evaluate(
             "(range) => { range.value = 80; range.dispatchEvent(new Event('change')); }")
         wait_until(page, "Math.abs(program.share() - 0.8) < 1e-6")
-        assert "mm deep, of" in page.locator(".sk-depth").inner_text()
+        assert "80% of the way" in page.locator(".sk-depth").inner_text()
         assert page.errors == []
     assert json.loads(app.template.file.read_text()).keys() == true_joints.keys()

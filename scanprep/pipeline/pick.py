@@ -9,17 +9,17 @@ from ..arguments import Place, UsageError
 from ..cli import MeshArg, Unit
 from ..console import Metric, Outcome, bar
 from ..geometry.files import name_of
-from ..geometry.landmark_writing import Format, landmark_ending
+from ..geometry.landmark_names import FACE
+from ..geometry.landmark_writing import CLICKED_JOINTS, Format, landmark_ending
 from ..geometry.landmarks import read_landmarks
 from ..ranges import Range
 from ..viewer.clicked import Clicked
 from ..viewer.joints import JointApp
-from ..viewer.landmark_names import FACE, HUMANOID, read_names
+from ..viewer.landmark_names import HUMANOID, read_names
 from ..viewer.pick import PickApp
 from .scans import find_scans
 
 ScansArg = Annotated[tuple[Path, ...], Place("[SCAN ...]")]
-FEATURES = ".features.json"          # ending of the joints of a scan; no command takes them for its landmarks
 Port = Annotated[int, Range(0, 65535)]
 
 
@@ -82,9 +82,10 @@ def _run_mending(folder: Path, scans: tuple[Path, ...], ending: str, names: str,
 
 def _joint_app(scan: Path, names: str, unit: Unit | None, start: Path | None) -> JointApp:
     """Open a scan to click joints in, with those of an earlier call and of a file to start with."""
-    body = Clicked(scan, scan.with_name(name_of(scan) + FEATURES), unit, opacity=0.45)
+    # in the file's own numbers: scape statue fit finds the unit by itself, and takes joints in that of the scan
+    body = Clicked(scan, scan.with_name(name_of(scan) + CLICKED_JOINTS), unit or "m", opacity=0.45)
     for file in (start, body.file if body.file.exists() else None):
-        body.places |= {} if file is None else read_landmarks(file, None, unit)
+        body.places |= {} if file is None else read_landmarks(file, None, body.unit)
     with bar("reading"):
         app = JointApp(body, HUMANOID if names == "ten" else read_names(names), FACE)
     if start is not None:                # also what nobody clicks is in the file

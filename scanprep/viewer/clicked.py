@@ -96,8 +96,8 @@ class Clicked:
         if self._shown is None:
             shape, points = self.body.shape, self.body.points
             # 150,000 points of 4 mm look dense; more are slow to turn
-            self._shown = thin_solid(Solid(shape, opacity=self.opacity)) if isinstance(shape, Mesh) and self.body.has_surface else \
-                Dots(points[::max(1, len(points) // 150_000)], CLAY, 0.004)
+            self._shown = thin_solid(Solid(shape, opacity=self.opacity)) if isinstance(shape, Mesh) and \
+                self.body.has_surface else Dots(points[::max(1, len(points) // 150_000)], CLAY, 0.004)
         return self._shown
 
 

@@ -1,7 +1,7 @@
 """Click joint centres inside a body in the browser: `scape pick --joints`.
 
-A click is a ray through the body. The middle of where it is inside is proposed as the joint; the ray that is mirrored at
-the body's symmetry proposes the joint of the other side, which a click accepts.
+A click is a ray through the body. The middle of where it is inside is proposed as the joint. The ray that is mirrored
+at the body's symmetry proposes the joint of the other side, which a click accepts.
 """
 from __future__ import annotations
 
@@ -87,4 +87,4 @@ class JointApp(PickApp):
         mirrored = mirror_click(body.body, self.mirror_plane(), *ray, joint)
         if mirrored is not None:
             body.predicted[other] = mirrored
-            self.note = f"“{other}” is proposed where the mirror has it: click the blue ball to take it, or its own place"
+            self.note = f"“{other}” is proposed where the mirror has it: click its blue ball, or another place"

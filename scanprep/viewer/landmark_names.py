@@ -5,7 +5,7 @@ from pathlib import Path
 
 from ..arguments import UsageError
 from ..geometry import storage
-from ..geometry.landmark_names import TEN
+from ..geometry.landmark_names import FACE, TEN
 from ..geometry.sides import other_side
 
 # landmarks of the CAESAR survey, spelt as in its files: on the middle line, and on both sides of the body
@@ -19,10 +19,9 @@ _PAIRED = ("Infraorbitale", "Tragion", "Gonion", "Clavicale", "Thelion/Bustpoint
            "Calcaneous, Post.", "Digit II")
 CAESAR = (*_MIDDLE, *(f"{side} {name}" for name in _PAIRED for side in ("Rt.", "Lt.")))
 
-# points of the surface of a head; joints of the generic humanoid of `scape statue`, and what to aim at for them
-FACE = ("nose tip", "chin", "left eye", "right eye", "left ear", "right ear", "top of head", "mouth")
-HUMANOID = ("l_shoulder", "r_shoulder", "l_elbow", "r_elbow", "l_wrist", "r_wrist", "l_hip", "r_hip", "l_knee", "r_knee",
-            "l_ankle", "r_ankle", "skullbase", "vl5", "l_sternoclavicular", "r_sternoclavicular", *FACE)
+# joints of the generic humanoid of `scape statue` and points of the face, and what to aim at
+HUMANOID = ("l_shoulder", "r_shoulder", "l_elbow", "r_elbow", "l_wrist", "r_wrist", "l_hip", "r_hip", "l_knee",
+            "r_knee", "l_ankle", "r_ankle", "skullbase", "vl5", "l_sternoclavicular", "r_sternoclavicular", *FACE)
 AIMS = {"shoulder": "middle of the rounded end of the shoulder",
         "hip": "a hand's width above the crotch, half way out, "
                "and a little nearer to the front than the middle",

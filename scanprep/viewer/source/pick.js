@@ -136,8 +136,7 @@ export class Pick extends Program {
     const { depth } = this.state;
     this.depthLabel.hidden = !depth;
     if (!depth) return;
-    const thick = 1000 * distance(...depth.ends);
-    this.depthLabel.firstChild.textContent = `“${depth.name}” is ${(thick * this.share()).toFixed(0)} mm deep, of ${thick.toFixed(0)} mm in the body: `;
+    this.depthLabel.firstChild.textContent = `“${depth.name}” lies at ${(100 * this.share()).toFixed(0)}% of the way through the body: `;
     if (document.activeElement !== this.depth) this.depth.value = 100 * this.share();
   }
 
