@@ -31,7 +31,7 @@ ROOMS = {
         "alignment": "fusion geometry",
         "registration": "alignment cleaning correspondence geometry skeleton synthetic",
         "surfaces": "adapters alignment cleaning decimation fusion geometry registration repair skeleton",
-        "viewer": "alignment batch depth_camera geometry pictures registration",
+        "viewer": "alignment batch depth_camera geometry pictures registration skeleton",
         "pipeline": "batch cleaning correspondence geometry pictures registration skeleton synthetic viewer"},
     "model": {
         "fitting": "", "motion": "", "resolution": "",

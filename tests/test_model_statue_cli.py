@@ -10,16 +10,24 @@ from trimesh.remesh import subdivide_to_size
 from completion.__main__ import main
 from completion.viewing.kinds import model_of_report
 from model import load_model
-from model.statue import report
+from model.statue import commands, report
 from model.statue.commands import judge_statue, read_scan
+from model.statue.control.files import humanoid
 from model.statue.control.model import HOLE, MEASURED, OUTSIDE
 from model.statue.detail.reconstruction import Level
 from model.statue.files import load_statue
-from model.statue.fit import FittedStatue, Posed
+from model.statue.fit import FittedStatue, Posed, UnplacedError
+from model.statue.registration.automatic import Features
 from model.statue.registration.features import FeatureFit
 from scanprep import Mesh, read_mesh, write_mesh
+from scanprep.geometry.landmark_names import FACE
+from scanprep.geometry.landmarks import read_landmarks
 from scanprep.pipeline.scans import ScanTask
 from scanprep.synthetic.people import LANDMARKS, BodyShape, SyntheticPerson, synthesise_walk
+from scanprep.viewer.clicked import Clicked
+from scanprep.viewer.joints import JointApp
+from scanprep.viewer.landmark_names import HUMANOID
+from scanprep.viewer.messages import Message
 
 JOINTS = {"vl5": 1, "skullbase": 3, "l_shoulder": 4, "l_elbow": 5, "l_wrist": 6, "r_shoulder": 7, "r_elbow": 8,
           "r_wrist": 9, "l_hip": 10, "l_knee": 11, "l_ankle": 12, "r_hip": 13, "r_knee": 14, "r_ankle": 15}
@@ -214,8 +222,8 @@ def test_a_scan_in_millimetres_on_a_floor_becomes_a_body_in_metres(person, tmp_p
     faces = np.concatenate([person.mesh.faces, np.concatenate([corners[:, :3], corners[:, [0, 2, 3]]])
                             + len(person.mesh.vertices)])
     write_mesh(tmp_path / "scan.ply", Mesh(1000 * np.concatenate([person.mesh.vertices, floor]), faces))
-    body, texture, rows, _ = read_scan(ScanTask("scan", tmp_path / "scan.ply"), None)
-    assert texture is None and np.ptp(body.vertices[:, 2]) == pytest.approx(1.82, abs=0.01)
+    body, texture, rows, _, metre = read_scan(ScanTask("scan", tmp_path / "scan.ply"), None)
+    assert metre == 0.001 and texture is None and np.ptp(body.vertices[:, 2]) == pytest.approx(1.82, abs=0.01)
     assert np.abs(len(body.vertices) / len(person.mesh.vertices) - 1) < 0.02
     assert any("mm" in str(row.value) for row in rows) and any("floor" in row.name for row in rows)
 
@@ -225,3 +233,56 @@ def test_what_is_done_is_not_done_again(made, capsys):
     assert run("fit", made / "scan.ply", "-o", made / "statue", "--features", made / "features.json", "--unit", "mm",
                "--size", 512) == 0
     assert (made / "statue" / "statue.glb").stat().st_mtime_ns == before
+
+
+def test_a_statue_leaves_its_joints_to_be_mended_in_the_unit_of_its_scan(made, person):
+    joints = read_landmarks(made / "statue" / "features.json", unit="mm")
+    assert {"nose tip", "top of head", *JOINTS} <= set(joints)
+    assert np.linalg.norm(joints["l_elbow"] - person.joints[JOINTS["l_elbow"]]) < 0.02
+
+
+def test_joints_clicked_from_the_front_fit_a_figure_without_a_unit(person, tmp_path, monkeypatch):
+    """The whole road: a refused figure of a person in millimetres is clicked, saved, and fitted by that file."""
+    scan = tmp_path / "anna.ply"
+    write_mesh(scan, person.mesh.with_vertices(1000 * person.mesh.vertices))
+    app = JointApp(Clicked(scan, tmp_path / "anna.features.json", "m"), HUMANOID, FACE)
+    for name, j in JOINTS.items():
+        if name not in ("vl5", "skullbase"):
+            ray = {"origin": (1000 * person.joints[j] - [0, 3000, 0]).tolist(), "direction": [0, 1, 0]}
+            app.handle(Message("place", {"pane": 0, "name": name, **ray}), lambda message: None)
+    kept = {}
+    monkeypatch.setattr(commands, "fit_statue", lambda scan, joints, points, *more: kept.update(joints) or refuse())
+    assert run("fit", scan, "-o", tmp_path / "statue", "--features", tmp_path / "anna.features.json") == 1
+    off = {name: 1000 * np.linalg.norm(place - person.joints[JOINTS[name]]) for name, place in kept.items()}
+    hips = [off.pop("l_hip"), off.pop("r_hip")]
+    assert len(off) == 10 and max(off.values()) < 15 and max(hips) < 25, (off, hips)
+
+
+def refuse(joints=None):
+    """What a figure in which nobody was found ends with."""
+    raise UnplacedError("scan: nobody", Features(joints or {}, {}, (), None, None, "nobody"))
+
+
+def test_a_refused_figure_opens_with_what_was_found_and_may_be_fitted_there(person, tmp_path, monkeypatch, capsys):
+    """The refusal names the command, its file is in the scan's unit, and the output stays usable."""
+    scan, output = tmp_path / "anna.ply", tmp_path / "statue"
+    write_mesh(scan, person.mesh.with_vertices(1000 * person.mesh.vertices))
+    joints = {name: person.joints[j] for name, j in JOINTS.items()}
+    for found in (joints, {}):
+        monkeypatch.setattr(commands, "fit_statue", lambda *inputs, found=found: refuse(found))
+        assert run("fit", scan, "-o", output) == 1
+        told = " ".join(capsys.readouterr().err.split())
+        start = f" --start {output}/.scapekit/refused/anna.json" if found else ""
+        assert f"nobody; click its joints: scape pick {scan} --joints{start}, then fit it with --features" in told
+    start = read_landmarks(output / ".scapekit" / "refused" / "anna.json")
+    np.testing.assert_allclose(start["l_elbow"], 1000 * joints["l_elbow"])
+    (tmp_path / "few.json").write_text(json.dumps({"l_elbow": [0, 0, 1]}))
+    assert run("fit", scan, "-o", output, "--features", tmp_path / "few.json") == 1
+    told = " ".join(capsys.readouterr().err.split())
+    assert f"expected at least three joints or points, got 1; click more: scape pick {scan} --joints" in told
+    assert "--features" not in told.split("got 1")[1]
+
+
+def test_the_names_offered_to_be_clicked_are_those_of_the_humanoid():
+    control = humanoid()
+    assert set(HUMANOID) == {*control.skeleton.names[1:], *FACE} and set(FACE) <= set(control.landmarks)

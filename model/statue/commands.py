@@ -12,13 +12,16 @@ import numpy as np
 from scanprep.arguments import UsageError
 from scanprep.batch.pool import Workers
 from scanprep.batch.room import TaskContext
-from scanprep.batch.workspace import Task, Workspace
+from scanprep.batch.workspace import HOME, Task, Workspace
 from scanprep.cleaning.clean_scan import clean_scan, cleaning_doubts
 from scanprep.cli import MM, Output, PersonUnit, ScanArg
 from scanprep.console import Metric, Outcome, bar, judgement_of, judgement_row, write_report
 from scanprep.folders import FolderCommand, do_one, figure
-from scanprep.geometry.files import write_mesh
+from scanprep.geometry.files import name_of, write_mesh
 from scanprep.geometry.format_common import metres_of
+from scanprep.geometry.landmark_names import FACE
+from scanprep.geometry.landmark_writing import CLICKED_JOINTS
+from scanprep.geometry.landmarks import write_landmarks
 from scanprep.geometry.mesh import Mesh
 from scanprep.judgement import NAMED, Judgement, implausible_body
 from scanprep.pictures.gltf import write_animated_glb
@@ -52,7 +55,7 @@ from .detail.reconstruction import (
 from .detail.subdivision import subdivide_adaptive, subdivide_uniform
 from .detail.texels import bake_texture, scan_look
 from .files import BODY, body_model, load_statue, save_statue, write_body, write_for_programs, write_statue_glb
-from .fit import FittedStatue, StatueConfig, fit_statue
+from .fit import FittedStatue, StatueConfig, UnplacedError, fit_statue
 from .motion.motions import follower_of, read_statue_motion, write_body_motion
 from .outer import keep_outer
 from .own_mesh import OWN_MESH, animate_own_mesh, write_own_mesh
@@ -60,6 +63,7 @@ from .registration.automatic import person_unit
 from .registration.clicks import read_features
 from .report import in_motion, motion_pictures, parts_without_data, statue_page, statue_picture
 
+FEATURES = "features.json"           # joints and points of the face of a statue, to be mended in scape pick --joints
 LEFT_BY_MAP = "error left by the map where it is one-to-one, mean"
 FINE = StatueConfig(displacement=DisplacementConfig(size=2048))
 
@@ -80,8 +84,8 @@ def fit(scan: ScanArg, output: Output, features: Path | None = None, control: Pa
         features: Joint centres and points of the surface by name, any landmark file; for a folder of scans, the folder
             of such files.
         control: Control model of your own: a skinned GLB, or control.npz of another statue; else the generic humanoid.
-        unit: Unit of the scan and the features; "unknown": it is found together with the person. Else metres with
-            --features, and without them that in which the body would be as tall as a person.
+        unit: Unit of the scan and the features; "unknown": it is found together with the person. Else that in which
+            the body would be as tall as a person, and metres with --control.
         own_mesh: Write own.glb too: the file's own vertices, materials and textures on the skeleton.
         names: Whose names the bones of own.glb have: mixamo, unity, unreal, vrm, h-anim or opensim.
         workers: Who fits the scans of a folder.
@@ -89,14 +93,17 @@ def fit(scan: ScanArg, output: Output, features: Path | None = None, control: Pa
     if names and not own_mesh:
         raise UsageError("--names: expected --own-mesh with it; statue.glb has our names, scape statue animate gives it "
                          "others")
-    work = Work(humanoid() if control is None else read_control(control), config, unit, own_mesh, names)
+    work = Work(humanoid() if control is None else read_control(control), config, unit, own_mesh, names, output)
     if not scan.is_dir():
         if features is None and control is not None:
-            raise UsageError("--control: expected --features with the joints of that control model; only the generic "
-                             "humanoid is found by itself")
+            raise UsageError("--control: expected --features with joints of that control model, as only the generic "
+                             "humanoid is found by itself; write the names of some into names.txt and click them: "
+                             "scape pick SCAN --joints --names names.txt. It has "
+                             f"{', '.join(work.control.skeleton.names)}")
         return do_one("fitting the statue", space, work, Task("statue", ScanTask("statue", scan, features)),
-                      {"statue": config}, f"open {quote(str(output / 'report.html'))}; a BVH file of yours moves it: "
-                      f"scape statue animate {quote(str(output))} walk.bvh -o walking")
+                      {"statue": config}, f"open {quote(str(output / 'report.html'))}; if joints are in wrong places: "
+                      f"{_pick(scan, output / FEATURES)}; a BVH file of yours moves it: scape statue animate "
+                      f"{quote(str(output))} walk.bvh -o walking")
     if features is not None and not features.is_dir():
         raise UsageError(f"--features: expected a folder for a folder of scans, got {features}")
     tasks = [Task(one.name, one if features else replace(one, landmarks=None), one.name)
@@ -117,29 +124,60 @@ class Work:
     unit: str | None = None                                       # of scans and features, where files cannot tell
     own_mesh: bool = False                                        # whether own.glb is written
     names: Names | None = None                                    # of its bones
+    output: Path = field(default=Path(), metadata={"digest": False})
     command: str = field(default="", metadata={"digest": False})  # for the report of each scan of a folder
 
     def __call__(self, inputs: ScanTask, context: TaskContext) -> list[Metric]:
         """Fit the statue of some files into the folder of a room; the figures."""
         start = time.perf_counter()
         unit = resolve_unit(inputs.scan, self.unit)
-        scan, texture, rows, doubts, metres = read_scan(inputs, unit)
+        person = self.control.skeleton.names == humanoid().skeleton.names
+        scan, texture, rows, doubts, metres = read_scan(inputs, unit, person)
+        scale = metres / metres_of(unit)     # what the unit of the file was multiplied by
         joints = points = None
         if inputs.landmarks is not None:
-            joints, points = read_features(inputs.landmarks, self.control, scan, unit)
+            joints, points = read_features(inputs.landmarks, self.control, scan, unit, scale)
             rows += [Metric("joints given", len(joints)), Metric("surface points given", len(points))]
-        statue = fit_statue(scan, joints, points, self.control, self.config, context.report_progress, context.step)
+            if len(joints) + len(points) < 3:
+                raise ValueError(f"{inputs.landmarks}: expected at least three joints or points, got "
+                                 f"{len(joints) + len(points)}; click more: {_pick(inputs.scan)}")
+        try:
+            statue = fit_statue(scan, joints, points, self.control, self.config, context.report_progress, context.step)
+        except UnplacedError as error:
+            # a result that failed leaves no file: what was found lies with the records of the output
+            found = {name: place / scale for name, place in {**error.features.joints, **error.features.points}.items()}
+            file = self.output / HOME / "refused" / f"{name_of(inputs.scan)}.json"
+            if found:
+                write_landmarks(file, found, unit)
+            clicked = inputs.scan.with_name(name_of(inputs.scan) + CLICKED_JOINTS)
+            raise ValueError(f"{inputs.scan}: {str(error).removeprefix('scan: ')}; click its joints: "
+                             f"{_pick(inputs.scan, file if found else None)}, then fit it with --features "
+                             f"{quote(str(clicked))}") from None
         if texture is not None or scan.colors is not None:
             image = context.step("texture", (self, inputs), lambda: bake_texture(
                 statue.control, statue.map, scan_look(texture or scan)))
             statue = replace(statue, texture=image)
         metrics = write_statue(context.folder, inputs.scan.name, scan, statue, rows, doubts)
+        write_landmarks(context.folder / FEATURES, {name: place / scale for name, place in features_of(statue).items()},
+                        unit)
         if self.own_mesh:
             metrics += write_own_mesh(context.folder / OWN_MESH, inputs.scan, metres, statue, self.names)
         if self.command:
             write_report(Outcome(context.folder, metrics, {"statue": self.config}, judgement=judgement_of(metrics)),
                          self.command, time.perf_counter() - start)
         return metrics
+
+
+def _pick(scan: Path, start: Path | None = None) -> str:
+    """Return the command that opens a scan to click its joints, beginning with those of a file."""
+    return f"scape pick {quote(str(scan))} --joints" + (f" --start {quote(str(start))}" if start else "")
+
+
+def features_of(statue: FittedStatue) -> dict[str, np.ndarray]:
+    """Return joint centres and points of the face of a statue (3,), metres: a start to mend them from."""
+    control = statue.control
+    joints = dict(zip(control.skeleton.names[1:], control.skeleton.joints[1:], strict=True))
+    return joints | {name: control.mesh.vertices[control.landmarks[name]] for name in FACE if name in control.landmarks}
 
 
 def write_statue(folder: Path, name: str, scan: Mesh, statue: FittedStatue, rows: list[Metric],
@@ -201,8 +239,8 @@ def judge_statue(statue: FittedStatue, scan: Mesh, finest: Level, left_out: Sequ
     # shares of the control mesh. Folded: standing persons have up to 0.014, dressed ones 0.07 to 0.13, half a person
     # 0.08. Measured: persons seen from all sides have 0.85 to 0.94, half a person 0.53.
     if shares["folded"] > 0.25 or shares["measured"] < 0.4:
-        failed.append(f"{summary}; a part of a person only, or the control model is not where the person is: features "
-                      "given by hand (--features) may help")
+        failed.append(f"{summary}; a part of a person only, or the control model is not where the person is: click "
+                      "its joints: scape pick SCAN --joints")
     elif shares["folded"] > 0.06 or shares["measured"] < 0.75:
         check.append(f"{summary}; clothes and hair, a part of a person, or joints in wrong places: look at the page")
     # share of the scan farther off than a hundredth of its size: right statues have up to 0.003, one in a coat 0.027,
@@ -231,19 +269,16 @@ def judge_statue(statue: FittedStatue, scan: Mesh, finest: Level, left_out: Sequ
     return found.merge(implausible_body(float(np.ptp(scan.vertices[:, statue.upright_axis]))))
 
 
-def read_scan(inputs: ScanTask, unit: str | None
+def read_scan(inputs: ScanTask, unit: str | None, person: bool = True
               ) -> tuple[Mesh, Texture | None, list[Metric], list[str], float]:
     """Read the body of a scan and its texture in metres, with figures, doubts of the cleaning, and metres a unit.
 
-    Without a unit it is metres where features are given, which may be on anything, else that of a person, and
-    where no unit gives a person's size it is brought to 1.7 m.
+    Without a unit it is the one in which a person is as tall as a person, and where none gives such a size the body is
+    brought to 1.7 m; anything else than a person is in metres.
     """
-    sought = unit is None and inputs.landmarks is None
-    unit = "m" if sought else unit
+    sought = unit is None and person
+    unit = unit or "m"
     scan, texture = read_sound_surface(inputs.scan, unit), read_texture(inputs.scan, unit)
-    # without a unit the reader may have guessed it
-    per_unit = metres_of(unit) if unit else float(
-        np.ptp(scan.vertices) / np.ptp(read_sound_surface(inputs.scan, "m").vertices))
     rows = [Metric("scan, triangles", len(scan.faces))]
     scan, inside = keep_outer(scan)
     if inside:
@@ -259,7 +294,7 @@ def read_scan(inputs: ScanTask, unit: str | None
     left = 1 - float(cleaned.kept.mean())
     if left > 0:
         rows.append(Metric("left out as floor, furniture, specks", 100 * left, "% of the points"))
-    return body, texture and texture.scale_by(metre), rows, doubts, per_unit * metre
+    return body, texture and texture.scale_by(metre), rows, doubts, metres_of(unit) * metre
 
 
 def reconstruct(statue: StatueArg, output: Output, level: LevelArg = 3, tolerance: Positive | None = None,

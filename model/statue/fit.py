@@ -8,6 +8,7 @@ from typing import Literal
 import numpy as np
 
 from scanprep.batch.room import Step, run_uncached
+from scanprep.geometry.landmark_names import FACE
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.sanitise import sanitise
 from scanprep.ranges import Settings
@@ -61,6 +62,14 @@ class StatueConfig(Settings):
         return cls(surface=SurfaceFitConfig.from_paper(), start="posed")
 
 
+class UnplacedError(ValueError):
+    """No pose of the control model was found on a scan; `features` are what was found."""
+
+    def __init__(self, problem: str, features: Features) -> None:
+        super().__init__(problem)
+        self.features = features
+
+
 @dataclass(frozen=True, eq=False)
 class Posed:
     """A control model in the pose of a scan, before its surface is fitted."""
@@ -112,7 +121,7 @@ def fit_statue(scan: Mesh, joints: Mapping[str, np.ndarray] | None = None,
     Raises
     ------
     ValueError
-        A scan without triangles, no person in it, or too few features.
+        A scan without triangles, or too few features; `UnplacedError`, with what was found, for no person in it.
 
     Examples
     --------
@@ -151,8 +160,7 @@ def pose_by_features(control: ControlModel, joints: Mapping[str, np.ndarray], po
 
 def with_head(control: ControlModel, fit: FeatureFit, points: Mapping[str, np.ndarray]) -> Posed:
     """Warp the head of a control model that was posed by features to the points of the face. [Statues] Eq. 5"""
-    face_names = ("left eye", "right eye", "nose tip", "mouth", "chin", "left ear", "right ear", "top of head")
-    start, face = fit.vertices, [name for name in face_names if name in points]
+    start, face = fit.vertices, [name for name in FACE if name in points]
     if "skullbase" not in control.skeleton.names:
         face = []
     try:
@@ -170,7 +178,7 @@ def pose_automatically(control: ControlModel, found: Features, registered: bool 
     pose alone left 1.4% of a real scan folded, this one 0.3%.
     """
     if found.fit is None or found.registered is None:
-        raise ValueError(f"scan: {found.problem}")
+        raise UnplacedError(f"scan: {found.problem}", found)
     posed, names = with_head(control, found.fit, found.points), control.skeleton.names
     lacking = control.weights[:, [j for j, name in enumerate(names) if name in found.missing]].sum(axis=1)
     posed = replace(posed, hidden=lacking > 0.5, missing=found.missing, problem=found.problem)

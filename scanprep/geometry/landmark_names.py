@@ -31,6 +31,8 @@ PAIRED = {
 # the ten landmarks that the README asks for: ends and bends of limbs, easy to find
 TEN = ("top of head", "navel", *(f"{side} {name}" for name in ("middle finger", "toe", "elbow outside", "knee")
                                  for side in ("left", "right")))
+# points of the surface of a head, from the front to the back
+FACE = ("nose tip", "mouth", "chin", "left eye", "right eye", "left ear", "right ear", "top of head")
 _KNOWN = {form: name for names in (MIDDLE, PAIRED) for name, forms in names.items() for form in (name, *forms)}
 
 

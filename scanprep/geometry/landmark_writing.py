@@ -16,6 +16,9 @@ Points = Mapping[str, np.ndarray]
 Format = Literal["json", "pp", "mrk.json", "fcsv", "scalismo.json", "csv", "lnd", "txt"]
 
 
+CLICKED_JOINTS = ".features.json"    # ending of the joints clicked in a scan; no command takes them for its landmarks
+
+
 def landmark_ending(format: Format) -> str:
     """Return the ending of a landmark file by which `landmarks_beside` finds it.
 

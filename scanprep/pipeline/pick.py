@@ -5,13 +5,17 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
-from ..arguments import Place
+from ..arguments import Place, UsageError
 from ..cli import MeshArg, Unit
 from ..console import Metric, Outcome, bar
-from ..geometry.landmark_writing import Format, landmark_ending
+from ..geometry.files import name_of
+from ..geometry.landmark_names import FACE
+from ..geometry.landmark_writing import CLICKED_JOINTS, Format, landmark_ending
+from ..geometry.landmarks import read_landmarks
 from ..ranges import Range
 from ..viewer.clicked import Clicked
-from ..viewer.landmark_names import read_names
+from ..viewer.joints import JointApp
+from ..viewer.landmark_names import HUMANOID, read_names
 from ..viewer.pick import PickApp
 from .scans import find_scans
 
@@ -20,7 +24,8 @@ Port = Annotated[int, Range(0, 65535)]
 
 
 def pick_landmarks(mesh: MeshArg, scans: ScansArg = (), names: str = "ten", format: Format = "json",
-                   unit: Unit | None = None, serve: Port | None = None) -> Outcome:
+                   unit: Unit | None = None, joints: bool = False, start: Path | None = None, serve: Port | None = None
+                   ) -> Outcome:
     """Click named points on a template and on scans, in the browser. Every click is saved at once.
 
     Of a set that scape prep run made, the scans come worst first, and are registered again where they were mended.
@@ -36,10 +41,19 @@ def pick_landmarks(mesh: MeshArg, scans: ScansArg = (), names: str = "ten", form
             mrk.json and fcsv (3D Slicer), scalismo.json, csv, lnd (CAESAR), txt. A file that is there keeps its format,
             and a copy of it as it was.
         unit: Unit of the scans and of their landmarks; of the mesh, if there are no scans.
+        joints: Click joint centres inside one body, for scape statue fit --features. Offers the joints of its generic
+            humanoid and points of the face, or --names; written beside the scan as NAME.features.json.
+        start: With --joints, a file of joints to begin with, such as features.json of scape statue fit.
         serve: Port to be looked at from another machine, 0 for any that is free: no browser is opened here, and how
             to reach it is printed.
     """
     ending = landmark_ending(format)
+    if joints:
+        if scans:
+            raise UsageError(f"--joints: expected one scan, got {1 + len(scans)}")
+        return _serve_until_closed(_joint_app(mesh, names, unit, start), serve)
+    if start is not None:
+        raise UsageError("--start: expected --joints with it")
     if (mesh / "set.json").exists():
         return _run_mending(mesh, scans, ending, names, unit, serve)
     template = Clicked.load(mesh, ending, None if scans else unit)      # in the unit in which scape prep run reads it
@@ -64,6 +78,19 @@ def _run_mending(folder: Path, scans: tuple[Path, ...], ending: str, names: str,
     return replace(done, metrics=[*done.metrics, Metric("scans that need a look",
                                                         sum(v.suspect for v in app.verdicts.values())),
                                   Metric("scans changed and not registered again", len(app.changed - {-1}))])
+
+
+def _joint_app(scan: Path, names: str, unit: Unit | None, start: Path | None) -> JointApp:
+    """Open a scan to click joints in, with those of an earlier call and of a file to start with."""
+    # in the file's own numbers: scape statue fit finds the unit by itself, and takes joints in that of the scan
+    body = Clicked(scan, scan.with_name(name_of(scan) + CLICKED_JOINTS), unit or "m", opacity=0.45)
+    for file in (start, body.file if body.file.exists() else None):
+        body.places |= {} if file is None else read_landmarks(file, None, body.unit)
+    with bar("reading"):
+        app = JointApp(body, HUMANOID if names == "ten" else read_names(names), FACE)
+    if start is not None:                # also what nobody clicks is in the file
+        body.save()
+    return app
 
 
 def _serve_until_closed(app: PickApp, serve: Port | None) -> Outcome:

@@ -38,6 +38,7 @@ class Clicked:
     places: Places = field(default_factory=dict)
     predicted: Places = field(default_factory=dict)
     surface: Clickable | None = None
+    opacity: float = 1.0                 # as it is drawn
     _shown: Shape | None = None
     _saved: bool = False                 # by this program
     _order: tuple[str, ...] = ()         # names in the order of the file, also of those taken away, which may come back
@@ -95,8 +96,8 @@ class Clicked:
         if self._shown is None:
             shape, points = self.body.shape, self.body.points
             # 150,000 points of 4 mm look dense; more are slow to turn
-            self._shown = thin_solid(Solid(shape)) if isinstance(shape, Mesh) and self.body.has_surface else \
-                Dots(points[::max(1, len(points) // 150_000)], CLAY, 0.004)
+            self._shown = thin_solid(Solid(shape, opacity=self.opacity)) if isinstance(shape, Mesh) and \
+                self.body.has_surface else Dots(points[::max(1, len(points) // 150_000)], CLAY, 0.004)
         return self._shown
 
 

@@ -1,11 +1,11 @@
-"""Names of landmarks to click: a good ten, the 73 of CAESAR, or those of a file."""
+"""Names of landmarks to click: a good ten, the 73 of CAESAR, joints and points of the face, or those of a file."""
 from __future__ import annotations
 
 from pathlib import Path
 
 from ..arguments import UsageError
 from ..geometry import storage
-from ..geometry.landmark_names import TEN
+from ..geometry.landmark_names import FACE, TEN
 from ..geometry.sides import other_side
 
 # landmarks of the CAESAR survey, spelt as in its files: on the middle line, and on both sides of the body
@@ -18,6 +18,15 @@ _PAIRED = ("Infraorbitale", "Tragion", "Gonion", "Clavicale", "Thelion/Bustpoint
            "Metatarsal Phal. I", "Metatarsal Phal. V", "Lateral Malleolus", "Medial Malleolus", "Sphyrion",
            "Calcaneous, Post.", "Digit II")
 CAESAR = (*_MIDDLE, *(f"{side} {name}" for name in _PAIRED for side in ("Rt.", "Lt.")))
+
+# joints of the generic humanoid of `scape statue` and points of the face, and what to aim at
+HUMANOID = ("l_shoulder", "r_shoulder", "l_elbow", "r_elbow", "l_wrist", "r_wrist", "l_hip", "r_hip", "l_knee",
+            "r_knee", "l_ankle", "r_ankle", "skullbase", "vl5", "l_sternoclavicular", "r_sternoclavicular", *FACE)
+AIMS = {"shoulder": "middle of the rounded end of the shoulder",
+        "hip": "a hand's width above the crotch, half way out, "
+               "and a little nearer to the front than the middle",
+        "skullbase": "middle of the neck, just below the chin", "vl5": "middle of the trunk, just below the navel",
+        "sternoclavicular": "inner end of the collar bone"}
 
 # words that stand for a list on the command line
 LISTS = {"ten": TEN, "caesar": CAESAR}

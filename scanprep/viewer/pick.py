@@ -61,6 +61,7 @@ class PickApp:
         self.building = not template.places        # it has none yet: its landmarks are clicked first
         self.alternating: int | None = None                      # pane on which the chosen name was clicked last
         self.question: dict[str, Any] | None = None              # about a click far from where it was expected
+        self.depth: dict[str, Any] | None = None                 # where the ray of the last click is inside the body
         self.done: list[Change] = []
         self.undone: list[Change] = []
         self.chosen: str | None = None
@@ -146,6 +147,7 @@ class PickApp:
             raise ValueError(f"a message of kind '{message.kind}', which nothing here answers")
         with self._lock:
             self.note, self.question = "", None
+            self.depth = self.depth if message.kind == "slide" else None
             action(send, **message.fields)
         send(self.state())
 
@@ -247,10 +249,11 @@ class PickApp:
 
     def on_confirm(self, send: Send, names: list[str]) -> None:
         """Accept predicted landmarks as they are."""
-        scan = self._editable(SCAN)
-        accepted = {name: scan.predicted[name] for name in names if name in scan.predicted}
+        pane = TEMPLATE if self.scan is None else SCAN
+        body = self._editable(pane)
+        accepted = {name: body.predicted[name] for name in names if name in body.predicted}
         if accepted:
-            self._change(self._number(SCAN), accepted)
+            self._change(self._number(pane), accepted)
             self.choose_next(None)
             self.note = f"{len(accepted)} taken as predicted; undo takes them back"
 

@@ -15,27 +15,29 @@ from scanprep.geometry.surface import check_surface
 from ..control.model import ControlModel
 
 
-def read_features(path: Path, control: ControlModel, scan: Mesh, unit: str | None = None
-                  ) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
+def read_features(path: Path, control: ControlModel, scan: Mesh, unit: str | None = None,
+                  scale: float = 1.0) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
     """Read joint centres and surface points, metres, by the names of the control model's joints and landmarks.
 
     Any landmark file is read, in its `unit`. In JSON a joint may also be a click, `{"ray": [origin, direction],
     "depth": d}`: its centre is then on the ray, where that is nearest to the medial axis of the scan, and d farther.
+    `scale` is by how much the scan is larger than in its file.
     """
     rays, places = _read_clicks(path, unit) if path.suffix == ".json" else ({}, {})
     if not rays:
-        places = read_landmarks(path, scan, unit)
+        places = read_landmarks(path, scan.with_vertices(scan.vertices / scale), unit)
     known = {*control.skeleton.names, *control.landmarks}
     strange = [name for name in [*rays, *places] if name not in known]
     if strange:
         raise ValueError(f"{path}: the control model has no joint or landmark '{strange[0]}'; its joints are "
                          f"{', '.join(control.skeleton.names)}; its landmarks {', '.join(control.landmarks)}")
+    places = {name: scale * place for name, place in places.items()}
     joints = {name: place for name, place in places.items() if name in control.skeleton.names}
     if rays:
         medial = MedialAxis(scan)
-        for name, click in rays.items():
+        for name, (origin, direction, depth) in rays.items():
             try:
-                joints[name] = medial.nearest_to_ray(*click)
+                joints[name] = medial.nearest_to_ray(scale * origin, direction, scale * depth)
             except ValueError as error:
                 raise ValueError(f"{path}: {name}: {error}") from None
     return joints, {name: place for name, place in places.items() if name in control.landmarks}

@@ -168,7 +168,7 @@ export class Pane {
     if (old) this.remove(old);
     if (!points.length) return;
     const steps = Float32Array.from(points.flat(), (value, i) => value - this.origin.getComponent(i % 3));
-    const layer = new Layer({ kind: "dots", name: "", labels, radius: 0.012, on_top: false, faint: true, hidden: [],
+    const layer = new Layer({ kind: "dots", name: "", labels, radius: 0.0065 * Math.max(this.home.height, this.home.width), on_top: false, faint: true, hidden: [],
       positions: { column: 0, low: [0, 0, 0], step: 1 }, shades: [{ name: "", palette: color.slice(1) }] }, [steps]);
     layer.group = group;
     this.add(layer);

@@ -45,12 +45,15 @@ export class Pick extends Program {
       there: button("move it there", "to where the ring is: where it is predicted", () => this.send("confirm", { names: [this.state.chosen] })),
     };
     this.insideBox = make("input", { type: "checkbox", onchange: () => { this.inside = this.insideBox.checked; } });
+    this.insideLabel = make("label", {}, this.insideBox, "inside the body (joints)");
+    this.depth = make("input", { type: "range", min: 0, max: 100, step: 1, "aria-label": "depth", onchange: () => this.slideTo(this.depth.value / 100) });
+    this.depthLabel = make("label", { class: "sk-depth", hidden: true }, make("span"), this.depth);
     this.measure = make("p", { class: "sk-measure" });
     this.question = make("div", { class: "sk-question", role: "alert", hidden: true });
     this.status.after(this.question);
     this.file = make("p", { class: "sk-file" });
     this.panel.append(this.scans, this.list, this.added, make("div", { class: "sk-buttons" }, ...Object.values(this.buttons)),
-      make("label", {}, this.insideBox, "inside the body (joints)"), this.measure, this.file,
+      this.insideLabel, this.depthLabel, this.measure, this.file,
       this.help(KEYS));
   }
 
@@ -81,7 +84,7 @@ export class Pick extends Program {
 
   // Predicted landmarks that nobody has clicked yet.
   waiting() {
-    const { predicted = {}, places = {} } = this.state?.panes[1] ?? {};
+    const { predicted = {}, places = {} } = this.state?.panes.at(-1) ?? {};
     return Object.fromEntries(Object.entries(predicted).filter(([name]) => !(name in places)));
   }
 
@@ -102,7 +105,10 @@ export class Pick extends Program {
     this.buttons.pair.textContent = state.pair ? `exchange with ${state.pair}` : "exchange the pair";
     this.buttons.next.disabled = state.names.length < 2;
     this.buttons.there.hidden = !(this.off(state.chosen) > OFF);
-    this.buttons.swap.hidden = this.buttons.pair.hidden = this.buttons.predict.hidden = this.buttons.confirm.hidden = state.panes.length < 2;
+    this.buttons.swap.hidden = this.buttons.pair.hidden = this.buttons.predict.hidden = state.panes.length < 2;
+    this.buttons.confirm.hidden = this.buttons.swap.hidden && !state.joints;
+    this.insideLabel.hidden = Boolean(state.joints);
+    this.tellDepth();
     this.names();
     this.tellFile();
     this.ask(state.question);
@@ -111,12 +117,33 @@ export class Pick extends Program {
   }
 
   hint() {
-    const { chosen, fixed, panes } = this.state;
-    if (!chosen) return "";
+    const { chosen, fixed, panes, hint } = this.state;
+    if (!chosen || hint) return hint ?? "";
     if (panes.length < 2) return `Click “${chosen}” on the template.`;
     const [template, scan] = panes.map((pane) => chosen in pane.places);
     if (!fixed && !template && !scan) return `Click “${chosen}” on the template, then on the scan.`;
     return fixed || template ? `Click “${chosen}” on the scan.` : `Now the same, “${chosen}”, on the template.`;
+  }
+
+  // How deep the last joint lies on its ray, from where that enters the body to where it leaves: 0 to 1.
+  share() {
+    const { depth, panes } = this.state;
+    const [from, to] = depth.ends, all = distance(from, to);
+    return panes[0].places[depth.name].reduce((sum, x, k) => sum + (x - from[k]) * (to[k] - from[k]), 0) / (all * all);
+  }
+
+  tellDepth() {
+    const { depth } = this.state;
+    this.depthLabel.hidden = !depth;
+    if (!depth) return;
+    this.depthLabel.firstChild.textContent = `“${depth.name}” lies at ${(100 * this.share()).toFixed(0)}% of the way through the body: `;
+    if (document.activeElement !== this.depth) this.depth.value = 100 * this.share();
+  }
+
+  slideTo(share) {
+    const { name, ends: [from, to] } = this.state.depth;
+    const direction = to.map((x, k) => x - from[k]);
+    this.send("slide", { pane: 0, name, direction, by: (share - this.share()) * distance(from, to) }, "depth");
   }
 
   // A click that is far from where the landmark was expected: was it meant?
@@ -176,17 +203,31 @@ export class Pick extends Program {
   // Landmarks as dots with names, in every pane.
   paint() {
     if (!this.figure || !this.state) return;
+    if (this.state.joints) this.figure.panes[0].overlays = [(context, pane) => this.drawDepth(context, pane)];
     if (this.figure.panes[1]) this.figure.panes[1].overlays = [(context, pane) => this.drawOff(context, pane)];
     this.figure.panes.slice(0, 2).forEach((pane, i) => {
       const marks = this.state.panes[i];
       if (!marks) return;
-      const groups = { predicted: i === 1 ? this.waiting() : {}, set: {}, chosen: {} };
+      const groups = { predicted: i === this.state.panes.length - 1 ? this.waiting() : {}, set: {}, chosen: {} };
       for (const [name, place] of Object.entries(marks.places)) groups[name === this.state.chosen ? "chosen" : "set"][name] = place;
       for (const [group, places] of Object.entries(groups)) {
         const labels = Object.keys(places).map((name) => group === "predicted" ? `${name} ?` : name);
         pane.setDots(group, Object.values(places), labels, COLORS[group]);
       }
     });
+  }
+
+  // The ray of the last click, inside the body.
+  drawDepth(context, pane) {
+    const ends = this.state.depth?.ends.map((place) => pane.project(new Vector3().fromArray(place).sub(pane.origin)));
+    if (!ends?.every(Boolean)) return;
+    const scale = pane.canvas.width / Math.max(pane.canvas.clientWidth, 1);
+    context.strokeStyle = context.fillStyle = COLORS.chosen;
+    context.lineWidth = 2 * scale;
+    context.beginPath();
+    for (const end of ends) context.lineTo(end.x * scale, end.y * scale);
+    context.stroke();
+    for (const end of ends) context.fillRect((end.x - 3) * scale, (end.y - 3) * scale, 6 * scale, 6 * scale);
   }
 
   // A line from each landmark that is far off to a ring where it is predicted.
@@ -232,7 +273,8 @@ export class Pick extends Program {
       const dragging = !pane.controls.enabled;
       down = null;
       pane.controls.enabled = true;
-      if (dragging && moved) this.place(pane, number, name, event, drag);
+      if (!moved && this.state.joints && name in this.waiting()) this.send("confirm", { names: [name] });
+      else if (dragging && moved) this.place(pane, number, name, event, drag);
       else if (!moved && name && name !== this.state.chosen && !(name in this.waiting())) this.send("choose", { name });
       else if (!moved) this.place(pane, number, name ?? this.state.chosen, event, 0);
     });
@@ -241,7 +283,7 @@ export class Pick extends Program {
   // The landmark under the pointer; one behind the body only where joints are clicked, which are inside.
   near(pane, number, event) {
     const box = pane.canvas.getBoundingClientRect();
-    const marks = { ...(number === 1 ? this.waiting() : {}), ...this.state.panes[number].places };
+    const marks = { ...(number === this.state.panes.length - 1 ? this.waiting() : {}), ...this.state.panes[number].places };
     let best = null, least = NEAR;
     for (const [name, place] of Object.entries(marks)) {
       const point = new Vector3().fromArray(place).sub(pane.origin), at = pane.project(point);
@@ -265,9 +307,10 @@ export class Pick extends Program {
     const { chosen, scan, scans, panes } = this.state;
     const pane = panes.length > 1 && chosen in panes[1].places ? 1 : 0;
     const slide = (by) => {
-      if (!(chosen in panes[pane].places)) return;
-      const direction = new Vector3().fromArray(panes[pane].places[chosen]).sub(this.figure.panes[pane].origin).sub(this.figure.panes[pane].camera.position);
-      this.send("slide", { pane, name: chosen, direction: direction.toArray(), by });
+      const name = this.state.depth?.name ?? chosen;
+      if (!(name in panes[pane].places)) return;
+      const direction = new Vector3().fromArray(panes[pane].places[name]).sub(this.figure.panes[pane].origin).sub(this.figure.panes[pane].camera.position);
+      this.send("slide", { pane, name, direction: direction.toArray(), by });
     };
     const actions = {
       n: () => this.step(1), p: () => this.step(-1), z: () => this.send(event.shiftKey ? "redo" : "undo"), Z: () => this.send("redo"), y: () => this.send("redo"),
