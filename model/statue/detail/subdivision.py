@@ -79,6 +79,22 @@ def subdivide_adaptive(mesh: Mesh, chart: Chart, displaced: Displaced, tolerance
     return _subdivide(mesh, chart, level, lambda now: _find_curved_sides(now, displaced, tolerance))
 
 
+def split_long_sides(mesh: Mesh, longest: float) -> Mesh:
+    """Divide triangles until no side is longer than `longest`, metres; the surface stays as it is, without a crack."""
+    if mesh.edge_lengths.max(initial=0) <= longest:
+        return mesh
+    mesh = mesh.submesh(slice(None))[0]                     # without unused vertices
+
+    def find_long(now: _Corners) -> np.ndarray:
+        corners = np.einsum("fkc,fcd->fkd", now.bary, mesh.corners[now.parent])
+        return np.linalg.norm(corners - np.roll(corners, -1, axis=1), axis=2) > longest
+
+    levels = int(np.ceil(np.log2(mesh.edge_lengths.max() / longest))) + 1
+    fine = _subdivide(mesh, Chart(np.zeros((len(mesh.vertices), 2)), mesh.faces), levels, find_long)
+    colors = None if mesh.colors is None else np.einsum("nc,ncd->nd", fine.bary, mesh.colors[mesh.faces[fine.parent]])
+    return Mesh(np.einsum("nc,ncd->nd", fine.bary, mesh.corners[fine.parent]), fine.faces, colors)
+
+
 def _subdivide(mesh: Mesh, chart: Chart, level: int, choose: Callable[[_Corners], np.ndarray]) -> Subdivision:
     """Split the sides (f, 3) that `choose` marks, `level` times or until it marks none."""
     now = _Corners(mesh.faces, chart.faces, np.tile(np.eye(3), (len(mesh.faces), 1, 1)), np.arange(len(mesh.faces)),
