@@ -205,7 +205,8 @@ def _without_planes(mesh: Mesh, link: float, config: CleanScanConfig, landmarks:
     """
     points, planes, kept, own = mesh.vertices, list[Plane](), list[Plane](), list[Plane]()
     label = np.full(len(points), -1)
-    while len(planes) < config.planes and len(kept) + len(own) <= 2 * config.planes and (label < 0).sum() > config.min_points:
+    most = 2 * config.planes        # of those that stay: a box-shaped head has six
+    while len(planes) < config.planes and len(kept) + len(own) <= most and (label < 0).sum() > config.min_points:
         rest = np.flatnonzero(label < 0)
         plane = find_plane(points[rest], config.floor_area, rng,
                            None if config.up is None else np.array(direction_of(config.up)), [*kept, *own])
