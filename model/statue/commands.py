@@ -23,15 +23,13 @@ from scanprep.geometry.landmark_names import FACE
 from scanprep.geometry.landmark_writing import CLICKED_JOINTS
 from scanprep.geometry.landmarks import write_landmarks
 from scanprep.geometry.mesh import Mesh
-from scanprep.judgement import NAMED, Judgement, implausible_body
+from scanprep.judgement import Judgement
 from scanprep.pictures.gltf import write_animated_glb
 from scanprep.pictures.sheets import save_png, write_gif
 from scanprep.pictures.textures import Texture, read_texture
 from scanprep.pipeline.scans import ScanTask, find_scans
 from scanprep.ranges import Positive
-from scanprep.registration.nonrigid import share_uncovered
 from scanprep.registration.unit import resolve_unit
-from scanprep.skeleton.roles import in_words
 from scanprep.surfaces.cloud import read_sound_surface
 
 from ..cli import read_body
@@ -43,7 +41,6 @@ from .control.files import humanoid, read_control
 from .control.model import ControlModel
 from .detail.displacement import DisplacementConfig, coverage_shares
 from .detail.reconstruction import (
-    Level,
     Reconstruction,
     adaptive_level,
     displace_surface,
@@ -52,24 +49,26 @@ from .detail.reconstruction import (
     measure_levels,
     remaining_error,
 )
-from .detail.subdivision import subdivide_adaptive, subdivide_uniform
+from .detail.subdivision import divide_long_edges, subdivide_adaptive, subdivide_uniform
 from .detail.texels import bake_texture, scan_look
 from .files import BODY, body_model, load_statue, save_statue, write_body, write_for_programs, write_statue_glb
 from .fit import FittedStatue, StatueConfig, UnplacedError, fit_statue
 from .motion.motions import follower_of, read_statue_motion, write_body_motion
-from .outer import keep_outer
+from .outer import cut_plinth, keep_outer
 from .own_mesh import OWN_MESH, animate_own_mesh, write_own_mesh
 from .registration.automatic import person_unit
 from .registration.clicks import read_features
 from .report import in_motion, motion_pictures, parts_without_data, statue_page, statue_picture
+from .verdict import judge_statue
 
 FEATURES = "features.json"           # joints and points of the face of a statue, to be mended in scape pick --joints
 LEFT_BY_MAP = "error left by the map where it is one-to-one, mean"
+SPLIT = 60        # longest side of triangles in the height of a figure: 3 cm on a person, as near as floors are to soles
 FINE = StatueConfig(displacement=DisplacementConfig(size=2048))
 
 
 def fit(scan: ScanArg, output: Output, features: Path | None = None, control: Path | None = None,
-        unit: PersonUnit | None = None, own_mesh: bool = False, names: Names | None = None,
+        unit: PersonUnit | None = None, cut: Positive | None = None, own_mesh: bool = False, names: Names | None = None,
         config: StatueConfig = FINE, workers: Workers = Workers(), *, space: Workspace) -> Outcome:
     """A scan of one person becomes a statue: a control model that moves, with the detail of the scan as an image.
 
@@ -86,14 +85,16 @@ def fit(scan: ScanArg, output: Output, features: Path | None = None, control: Pa
         control: Control model of your own: a skinned GLB, or control.npz of another statue; else the generic humanoid.
         unit: Unit of the scan and the features; "unknown": it is found together with the person. Else that in which
             the body would be as tall as a person, and metres with --control.
+        cut: Height of a plinth above the lowest point of the scan, in the numbers of its file; what lies below is left
+            out. Up is the axis along which the scan is longest.
         own_mesh: Write own.glb too: the file's own vertices, materials and textures on the skeleton.
         names: Whose names the bones of own.glb have: mixamo, unity, unreal, vrm, h-anim or opensim.
         workers: Who fits the scans of a folder.
     """
     if names and not own_mesh:
-        raise UsageError("--names: expected --own-mesh with it; statue.glb has our names, scape statue animate gives it "
-                         "others")
-    work = Work(humanoid() if control is None else read_control(control), config, unit, own_mesh, names, output)
+        raise UsageError("--names: expected --own-mesh with it; statue.glb has our names, and scape statue animate "
+                         "gives it others")
+    work = Work(humanoid() if control is None else read_control(control), config, unit, cut, own_mesh, names, output)
     if not scan.is_dir():
         if features is None and control is not None:
             raise UsageError("--control: expected --features with joints of that control model, as only the generic "
@@ -122,6 +123,7 @@ class Work:
     control: ControlModel
     config: StatueConfig
     unit: str | None = None                                       # of scans and features, where files cannot tell
+    cut: float | None = None                                      # height of a plinth, in the numbers of the file
     own_mesh: bool = False                                        # whether own.glb is written
     names: Names | None = None                                    # of its bones
     output: Path = field(default=Path(), metadata={"digest": False})
@@ -132,7 +134,7 @@ class Work:
         start = time.perf_counter()
         unit = resolve_unit(inputs.scan, self.unit)
         person = self.control.skeleton.names == humanoid().skeleton.names
-        scan, texture, rows, doubts, metres = read_scan(inputs, unit, person)
+        scan, texture, rows, doubts, metres = read_scan(inputs, unit, person, self.cut)
         scale = metres / metres_of(unit)     # what the unit of the file was multiplied by
         joints = points = None
         if inputs.landmarks is not None:
@@ -225,56 +227,12 @@ def write_statue(folder: Path, name: str, scan: Mesh, statue: FittedStatue, rows
     return rows
 
 
-def judge_statue(statue: FittedStatue, scan: Mesh, finest: Level, left_out: Sequence[str] = ()) -> Judgement:
-    """What a statue is worth, with the likely cause where it is not good; `left_out` are doubts of the cleaning.
-
-    `finest` is the finest level that was measured against the scan.
-    """
-    posed, shares = statue.posed, coverage_shares(statue.control, statue.map)
-    assert posed is not None, "made by fit_statue"
-    summary = (f"{100 * shares['folded']:.0f}% of the control mesh is folded against the scan, "
-               f"{100 * shares['measured']:.0f}% has data one-to-one")
-    missed = share_uncovered(scan, finest.mesh, 0.01 * float(np.sqrt(scan.face_areas.sum())))
-    failed, check = [], list(left_out)
-    # shares of the control mesh. Folded: standing persons have up to 0.014, dressed ones 0.07 to 0.13, half a person
-    # 0.08. Measured: persons seen from all sides have 0.85 to 0.94, half a person 0.53.
-    if shares["folded"] > 0.25 or shares["measured"] < 0.4:
-        failed.append(f"{summary}; a part of a person only, or the control model is not where the person is: click "
-                      "its joints: scape pick SCAN --joints")
-    elif shares["folded"] > 0.06 or shares["measured"] < 0.75:
-        check.append(f"{summary}; clothes and hair, a part of a person, or joints in wrong places: look at the page")
-    # share of the scan farther off than a hundredth of its size: right statues have up to 0.003, one in a coat 0.027,
-    # an arm clicked on the trunk 0.13, clicks of half the size 0.41
-    if missed > 0.02:
-        (failed if missed > 0.25 else check).append(
-            f"{100 * missed:.0f}% of the scan lies off the statue: joints in wrong places, or more than a person?")
-    # mean distance, metres: right statues have up to 0.0004, the paper's four people 0.0008, those in coats 0.0015 to
-    # 0.0032, crossed clicks of the legs 0.0014
-    if finest.mean > 0.001:
-        check.append(f"the detailed surface lies {MM * finest.mean:.1f} mm off the scan on average; folds, "
-                     "or a limb lies in another's place")
-    misfit = np.fmax(posed.features.joint_rms, posed.features.point_rms)
-    # metres: right statues have up to 0.022, those in coats 0.043; with left and right exchanged, joints have 0.039 and
-    # points 0.096
-    if misfit > 0.03:
-        check.append(f"features lie {MM * misfit:.0f} mm from those of the posed control model: left and right "
-                     "exchanged, one in a wrong place, or clothes?")
-    names, empty = statue.control.skeleton.names, {*parts_without_data(statue), *posed.missing}
-    lacking = [in_words(name) for name in names if name in empty]
-    check += [f"the scan has no data on {', '.join(lacking[:NAMED])}"] if lacking else []
-    check += [posed.problem] if posed.problem else []
-    found = Judgement.of(failed, check)
-    if names != humanoid().skeleton.names:
-        return found
-    return found.merge(implausible_body(float(np.ptp(scan.vertices[:, statue.upright_axis]))))
-
-
-def read_scan(inputs: ScanTask, unit: str | None, person: bool = True
+def read_scan(inputs: ScanTask, unit: str | None, person: bool = True, cut: float | None = None
               ) -> tuple[Mesh, Texture | None, list[Metric], list[str], float]:
     """Read the body of a scan and its texture in metres, with figures, doubts of the cleaning, and metres a unit.
 
     Without a unit it is the one in which a person is as tall as a person, and where none gives such a size the body is
-    brought to 1.7 m; anything else than a person is in metres.
+    brought to 1.7 m; anything else than a person is in metres. `cut` is the height of a plinth in the file's numbers.
     """
     sought = unit is None and person
     unit = unit or "m"
@@ -283,6 +241,11 @@ def read_scan(inputs: ScanTask, unit: str | None, person: bool = True
     scan, inside = keep_outer(scan)
     if inside:
         rows.append(Metric("inside the surface, left out", 100 * inside, "% of the surface"))
+    # what follows looks at vertices: a plinth of twelve triangles needs more of them
+    scan = divide_long_edges(scan, float(np.ptp(scan.vertices, axis=0).max(initial=0)) / SPLIT)
+    if cut is not None:
+        scan, cut_off = cut_plinth(scan, cut * metres_of(unit))
+        rows.append(Metric("below --cut, left out", 100 * cut_off, "% of the surface"))
     metre = person_unit(scan.vertices)[0] if sought else 1.0
     cleaned = clean_scan(scan.with_vertices(metre * scan.vertices))
     doubts = cleaning_doubts(cleaned)

@@ -67,6 +67,18 @@ def keep_outer(scan: Mesh) -> tuple[Mesh, float]:
     return (scan.submesh(~inside)[0], left_out) if left_out else (scan, 0.0)
 
 
+def cut_plinth(scan: Mesh, height: float) -> tuple[Mesh, float]:
+    """Leave out what lies lower than `height` above the lowest point, along the longest axis; also return its share.
+
+    ValueError where nothing would be left.
+    """
+    level = scan.vertices[:, np.ptp(scan.vertices, axis=0).argmax()]
+    above = (level >= level.min() + height)[scan.faces].all(axis=1)
+    if not above.any():
+        raise ValueError(f"cut: expected a height below that of the scan, {np.ptp(level):.3g}, got {height:.3g}")
+    return scan.submesh(above)[0], float(scan.face_areas[~above].sum() / scan.face_areas.sum())
+
+
 def _label_shells(scan: Mesh) -> np.ndarray:
     """Number the shell of every triangle (F,); vertices at one place are one."""
     key = scan.vertices.astype(np.float32) @ np.random.default_rng(0).random(3)        # one number sorts fast

@@ -203,12 +203,13 @@ def _without_planes(mesh: Mesh, link: float, config: CleanScanConfig, landmarks:
 
     Also tell whether there is a plane that was kept: one inside the footprint of the body, as the side of a pedestal.
     """
-    points, planes, kept = mesh.vertices, list[Plane](), list[Plane]()
+    points, planes, kept, own = mesh.vertices, list[Plane](), list[Plane](), list[Plane]()
     label = np.full(len(points), -1)
-    while len(planes) < config.planes and len(kept) <= config.planes and (label < 0).sum() > config.min_points:
+    most = 2 * config.planes        # of those that stay: a box-shaped head has six
+    while len(planes) < config.planes and len(kept) + len(own) <= most and (label < 0).sum() > config.min_points:
         rest = np.flatnonzero(label < 0)
         plane = find_plane(points[rest], config.floor_area, rng,
-                           None if config.up is None else np.array(direction_of(config.up)), kept)
+                           None if config.up is None else np.array(direction_of(config.up)), [*kept, *own])
         if plane is None:
             break
         # the body stands on the plane; its footprint is not removed
@@ -216,12 +217,30 @@ def _without_planes(mesh: Mesh, link: float, config: CleanScanConfig, landmarks:
         piece = label_pieces(mesh, standing, link)
         body = standing[piece == _body_of(points[standing], piece, config, landmarks)[0]] if len(standing) else standing
         off = rest[floor_points(points[rest], plane, points[body])]
+        if _is_face_of_body(mesh, off):
+            own.append(plane)
+            continue
         (planes if len(off) else kept).append(plane)
         label[off] = len(planes) - 1
     # what is left of a pedestal went with its top
     left = points[label < 0]
     flat = any(np.mean(np.abs(plane.height(left)) <= plane.thickness) > FLAT for plane in kept)
     return label, planes, flat
+
+
+def _is_face_of_body(mesh: Mesh, off: np.ndarray) -> bool:
+    """Test whether points (n,) on a plane are a flat face of the body, as a sole or the side of a box-shaped head.
+
+    Such a face goes on into the body all around. A floor and a pedestal touch it at the feet only.
+    """
+    chosen = np.zeros(len(mesh.vertices), dtype=bool)
+    chosen[off] = True
+    inside = chosen[mesh.faces].all(axis=1)
+    pair = mesh.face_pairs[inside[mesh.face_pairs].sum(axis=1) == 1]
+    shared = mesh.face_edges[pair[:, 0]][(mesh.face_edges[pair[:, 0], :, None] == mesh.face_edges[pair[:, 1], None]
+                                          ).any(axis=2)]
+    # length of the rim in roots of its area: a square has 4, soles 4 to 6, floors and pedestals under people 0.3 to 1.7
+    return bool(mesh.edge_lengths[shared].sum() > 3 * np.sqrt(mesh.face_areas[inside].sum())) and bool(len(shared))
 
 
 def label_pieces(mesh: Mesh, chosen: np.ndarray, link: float) -> np.ndarray:

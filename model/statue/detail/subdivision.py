@@ -101,7 +101,9 @@ def divide_long_edges(mesh: Mesh, longest: float) -> Mesh:
         return (length[first] > longest)[edge]
 
     no_chart = Chart(np.zeros((len(mesh.vertices), 2)), mesh.faces)
-    return _subdivide(mesh, no_chart, int(np.ceil(np.log2(most / longest))) + 2, find_long_sides).mesh(mesh)
+    fine = _subdivide(mesh, no_chart, int(np.ceil(np.log2(most / longest))) + 2, find_long_sides)
+    colors = None if mesh.colors is None else np.einsum("nc,ncd->nd", fine.bary, mesh.colors[mesh.faces[fine.parent]])
+    return Mesh(fine.points(mesh), fine.faces, colors)
 
 
 def _subdivide(mesh: Mesh, chart: Chart, level: int, choose: Callable[[_Corners], np.ndarray]) -> Subdivision:

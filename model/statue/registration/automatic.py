@@ -29,7 +29,7 @@ OFF, MARGIN = 0.042, 1.05
 TALL, SMALLEST, LARGEST = 1.7, 1.07, 2.31
 # metres: edges of the control model are 40 mm. At 25 mm a person of 800 triangles gives the joints of the full mesh
 LONGEST_EDGE = 0.025
-DOUBTED_OFF, DOUBTED_MARGIN = 0.025, 1.2         # a leg alone has 25 mm; dressed persons need a look
+DOUBTED_MARGIN = 1.2
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,7 +67,7 @@ def find_features(control: ControlModel, scan: Mesh) -> Features:
     joints, points, missing = _features(control, result, data, metres)
     fit = fit_features(control, joints, points) if len(joints) + len(points) > 2 else None
     registered = control.mesh.with_vertices(result.mesh.vertices / metres)
-    problem = why_uncertain(best.off, margin, result.uncovered) if fit else (
+    problem = why_uncertain(margin) if fit else (
         f"{number_of(len(joints), 'joint')} and {number_of(len(points), 'point')} of the face have data around them, "
         "too few to place a person: "
         "a part of one only?")
@@ -90,16 +90,11 @@ def nobody_problem(off: float, margin: float, size: str) -> str | None:
             "brought to metres first?")
 
 
-def why_uncertain(off: float, margin: float, missed: float) -> str | None:
-    """Explain why features should not be trusted, as with a limb in a wrong place; None where they may be."""
-    # share of a scan off the fitted body that is doubtful: synthetic persons have 0.005, three dressed ones 0.09 to
-    # 0.26, one with long hair 0.07
-    most_missed = 0.05
-    reasons = [text for text, wrong in (
-        (f"the posed body stays {1000 * off:.0f} mm off the scan", off > DOUBTED_OFF),
-        (f"facing another way it fits only {margin:.2f} times worse", margin < DOUBTED_MARGIN),
-        (f"{100 * missed:.0f}% of the scan lies off the registered one", missed > most_missed)) if wrong]
-    return "; ".join(reasons) + ": look at it, or click" if reasons else None
+def why_uncertain(margin: float) -> str | None:
+    """Explain why front and back may be exchanged; None where they are not. Distances are those of the finished statue.
+    """
+    return (None if margin >= DOUBTED_MARGIN else
+            f"facing another way it fits only {margin:.2f} times worse: look at it, or give joints by --features")
 
 
 def person_unit(points: np.ndarray) -> tuple[float, str]:
