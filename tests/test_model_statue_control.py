@@ -6,10 +6,14 @@ from fractions import Fraction
 
 import numpy as np
 import pytest
+import trimesh
 from animal_bodies import Animal
 from humanoid_maker import NAMES, freedom, nearest_marks
+from test_model_statue_cli import JOINTS
 
+from completion.__main__ import main
 from model.export.glb import encode_skinned_glb, write_skinned_glb
+from model.rig import joint_places
 from model.statue.control.chart import (
     Chart,
     automatic_chart,
@@ -23,10 +27,13 @@ from model.statue.control.chart import (
 )
 from model.statue.control.files import STORED, humanoid, humanoid_markers, read_control, write_control
 from model.statue.control.model import control_problem
+from model.statue.files import load_statue
+from model.statue.motion.motions import people_motion
+from scanprep import write_mesh
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.storage import StorageError
 from scanprep.skeleton.tree import Skeleton
-from scanprep.synthetic.people import LANDMARKS, MARKERS
+from scanprep.synthetic.people import LANDMARKS, MARKERS, SyntheticPerson, find_pose
 from scanprep.synthetic.topology import load_topology
 
 MIRROR = np.array([-1, 1, 1])
@@ -330,9 +337,10 @@ def not_a_number(tree, rest):
     struct.pack_into("<f", rest, 8 + view.get("byteOffset", 0), np.nan)
 
 
-def second_body(tree, rest):
+def second_skeleton(tree, rest):
     tree["scenes"][0]["nodes"].append(len(tree["nodes"]))
-    tree["nodes"].append({"name": "other", "mesh": 0, "skin": 0})
+    tree["nodes"].append({"name": "other", "mesh": 0, "skin": 1})
+    tree["skins"].append(tree["skins"][0])
 
 
 def lost_joint(tree, rest):
@@ -340,14 +348,20 @@ def lost_joint(tree, rest):
 
 
 @pytest.mark.parametrize(("change", "reason"), [
-    (drop_weights, "WEIGHTS_0"), (open_it, "open"), (drop_skin, "0 meshes that hang on joints"),
-    (not_a_number, "not finite"), (second_body, "2 meshes that hang on joints"), (lost_joint, "999")])
+    (drop_weights, "WEIGHTS_0"), (drop_skin, "0 meshes that hang on joints"), (not_a_number, "not finite"),
+    (second_skeleton, "2 meshes that hang on joints"), (lost_joint, "999")])
 def test_a_glb_that_is_no_control_model_is_refused_by_name(glb, change, reason):
     with pytest.raises(StorageError, match=rf"changed\.glb.*{reason}"):
         read_control(changed(glb, change))
 
 
-def test_texture_coordinates_in_two_charts_are_refused(glb):
+def test_an_open_control_mesh_is_closed(glb):
+    with pytest.warns(UserWarning, match="repaired and closed"):
+        again = read_control(changed(glb, open_it))
+    assert again.mesh.is_closed and len(again.mesh.faces) == len(humanoid().mesh.faces)
+
+
+def test_for_texture_coordinates_in_two_charts_one_is_made(glb):
     control = humanoid()
     faces, vertex = cut(control.mesh, [])
     half = control.mesh.corners[:, :, 0].mean(axis=1) > 0
@@ -355,8 +369,9 @@ def test_texture_coordinates_in_two_charts_are_refused(glb):
     uv = np.vstack([control.mesh.vertices[vertex][:, [0, 2]] / 4 + [0.2, 0.1],
                     control.mesh.vertices[vertex][:, [0, 2]] / 4 + [0.7, 0.1]])
     used, faces = np.unique(faces, return_inverse=True)
-    with pytest.raises(StorageError, match=r"changed\.glb.*2 charts.*without any, a chart is made"):
-        read_control(with_uv(glb, Chart(uv[used], faces.reshape(-1, 3)), control.mesh))
+    with pytest.warns(UserWarning, match=r"changed\.glb.*a chart is made.*2 charts"):
+        again = read_control(with_uv(glb, Chart(uv[used], faces.reshape(-1, 3)), control.mesh))
+    assert chart_problem(again.mesh, again.chart) is None
 
 
 def test_two_bodies_in_one_mesh_are_refused(tmp_path):
@@ -368,5 +383,52 @@ def test_two_bodies_in_one_mesh_are_refused(tmp_path):
                   skeleton=Skeleton(np.tile(control.skeleton.part_of_face, 2), control.skeleton.parents,
                                     control.skeleton.joints, NAMES))
     (tmp_path / "two.glb").write_bytes(encode_skinned_glb(rig))
-    with pytest.raises(StorageError, match=r"two\.glb.*2 components"):
+    with pytest.raises(StorageError, match=r"two\.glb.*2 components, the largest is 50%"):
         read_control(tmp_path / "two.glb")
+
+
+def with_eyes(path, pose=None):
+    """A skinned GLB of the humanoid in a pose, with two eyes as components of their own; no landmarks."""
+    control = humanoid()
+    rig = control.rig if pose is None else replace(control.rig, mesh=control.mesh.with_vertices(
+        control.rig.vertices(pose)), skeleton=replace(control.skeleton, joints=joint_places(control.skeleton, pose)))
+    ball = trimesh.creation.icosphere(1, 0.012)
+    head = NAMES.index("skullbase")
+    for side in ("left eye", "right eye"):
+        n, m = len(rig.mesh.vertices), len(ball.vertices)
+        place = rig.mesh.vertices[control.landmarks[side]]
+        mesh = Mesh(np.vstack([rig.mesh.vertices, ball.vertices + place]), np.vstack([rig.mesh.faces, ball.faces + n]))
+        skeleton = replace(rig.skeleton, part_of_face=np.r_[rig.skeleton.part_of_face, [head] * len(ball.faces)])
+        rig = replace(rig, mesh=mesh, skeleton=skeleton, weights=np.vstack([rig.weights, np.eye(17)[[head] * m]]),
+                      shapes=np.zeros((0, n + m, 3)))
+    write_skinned_glb(path, rig)
+
+
+def test_eyes_of_a_control_model_are_left_out_and_said(tmp_path):
+    with_eyes(tmp_path / "eyes.glb")
+    with pytest.warns(UserWarning, match=r"eyes\.glb: left out 2 small components"):
+        again = read_control(tmp_path / "eyes.glb")
+    assert len(again.mesh.faces) == len(humanoid().mesh.faces) and again.skeleton.names == NAMES
+    assert chart_problem(again.mesh, again.chart) is None
+
+
+@pytest.mark.slow
+def test_a_control_model_without_landmarks_in_another_pose_is_fitted_to_the_end(tmp_path, capsys):
+    """A GLB with eyes, its arms spread, and joints by hand on a person whose arms hang."""
+    pose = people_motion(humanoid(), np.zeros((17, 3)), find_pose("t_pose")[None]).poses[0]
+    with_eyes(tmp_path / "eyes.glb", pose)
+    person = SyntheticPerson()
+    write_mesh(tmp_path / "scan.ply", person.mesh)
+    (tmp_path / "features.json").write_text(json.dumps(
+        {name: person.joints[j].tolist() for name, j in JOINTS.items()}))
+    assert main(["statue", "fit", *map(str, (
+        tmp_path / "scan.ply", "--control", tmp_path / "eyes.glb", "--features", tmp_path / "features.json",
+        "--unit", "m", "-o", tmp_path / "out", "--size", 256))]) == 0
+    assert "left out 2 small components" in capsys.readouterr().err
+    told = json.loads((tmp_path / "out" / "report.json").read_text())["metrics"]
+    rows = {row["metric"]: row["value"] for row in told}
+    assert rows["level 3 to the scan, mean"] < 1.5 and (tmp_path / "out" / "report.html").is_file()
+    statue = load_statue(tmp_path / "out")
+    off = [np.linalg.norm(statue.control.skeleton.joints[NAMES.index(name)] - person.joints[j])
+           for name, j in JOINTS.items()]
+    assert max(off) < 0.03

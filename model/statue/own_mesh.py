@@ -1,4 +1,4 @@
-"""The file's own mesh on the skeleton of its statue: vertices, shells and materials as they came, with blend weights."""
+"""The file's own mesh on the skeleton of its statue: vertices, shells and materials as they came, with weights."""
 from __future__ import annotations
 
 from dataclasses import dataclass
@@ -13,6 +13,7 @@ from scanprep.geometry.files import read_mesh
 from scanprep.geometry.format_common import Contents, load_bytes
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.storage import StorageError, write_file
+from scanprep.geometry.surface import Surface
 from scanprep.pictures.textures import load_with_materials
 
 from ..blend_weights import strongest
@@ -31,6 +32,7 @@ OWN_MESH = "own.glb"
 # Stiff: the extent up to which a part of its own (eye, button, belt, shoe) keeps its shape; a sleeve has 0.25 and more.
 # Apart: a larger part whose median distance from the body is more (a staff, a shield) keeps its shape too.
 WELDED, STIFF, APART = 1e-5, 0.2, 0.03
+SAMPLES = 50_000     # points over the whole surface that tell how far its parts are from the body: 1 cm on a person
 DROPPED = ("KHR_draco_mesh_compression", "EXT_mesh_gpu_instancing")      # extensions whose arrays are written out plain
 
 
@@ -294,22 +296,27 @@ def carry_weights(statue: Statue, mesh: Mesh) -> tuple[np.ndarray, int]:
     body = Reconstruction(control, statue.map, fine).mesh()
     height = float(np.ptp(body.vertices[:, statue.upright_axis]))
     shells = Shells.of(mesh, WELDED * height)
-    places, shell = shells.mesh.vertices, shells.mesh.vertex_component
-    bound = bind_points(shells.mesh, body)
-    off = np.linalg.norm(bound @ body.vertices - places, axis=1)
-    weights = bound @ np.einsum("nc,ncj->nj", fine.bary, control.weights[control.mesh.faces[fine.parent]])
-    # extent and median distance of every connected part
-    order = np.lexsort((off, shell))
-    count = np.bincount(shell)
+    welded, shell = shells.mesh, shells.mesh.vertex_component
+    carried = np.einsum("nc,ncj->nj", fine.bary, control.weights[control.mesh.faces[fine.parent]])
+    weights = bind_points(welded, body, APART * height) @ carried
+    # extent of every connected part, and its median distance from the body, at vertices and evenly over the surface
+    points, faces, _ = welded.sample(SAMPLES, np.random.default_rng(0))
+    points, owner = np.vstack([welded.vertices, points]), np.r_[shell, shell[welded.faces[faces, 0]]]
+    close = Surface(body).closest(points)
+    order = np.lexsort((close.distances, owner))
+    count = np.bincount(owner)
     start = np.r_[0, np.cumsum(count)[:-1]]
-    sides = places[order]
-    extent = (np.maximum.reduceat(sides, start) - np.minimum.reduceat(sides, start)).max(axis=1)
-    stiff = (extent < STIFF * height) | (off[order][start + count // 2] > APART * height)
+    extent = (np.maximum.reduceat(points[order], start) - np.minimum.reduceat(points[order], start)).max(axis=1)
+    stiff = (extent < STIFF * height) | (close.distances[order][start + count // 2] > APART * height)
     stiff[np.argmax(extent)] = False
-    # the mean over the tenth of its vertices that is nearest to the body
-    rank = np.arange(len(order)) - start[shell[order]]
-    near = order[rank <= count[shell[order]] // 10]
-    mean = np.zeros((len(count), weights.shape[1]))
-    np.add.at(mean, shell[near], weights[near])
-    weights = np.where(stiff[shell][:, None], (mean / mean.sum(axis=1, keepdims=True))[shell], weights)
+    # the mean over the tenth of its points that is nearest to the body, and there to the part that carries most
+    near = order[np.arange(len(order)) - start[owner[order]] <= count[owner[order]] // 10]
+    near = near[stiff[owner[near]]]
+    shares = np.einsum("nc,ncj->nj", close.bary[near], carried[body.faces[close.faces[near]]])
+    carrier, votes, mean = shares.argmax(axis=1), *np.zeros((2, len(count), weights.shape[1]))
+    np.add.at(votes, (owner[near], carrier), 1)
+    most = carrier == votes.argmax(axis=1)[owner[near]]
+    np.add.at(mean, owner[near[most]], shares[most])
+    mean /= np.maximum(mean.sum(axis=1, keepdims=True), 1e-12)
+    weights = np.where(stiff[shell][:, None], mean[shell], weights)
     return strongest(weights)[shells.place], int(stiff.sum())

@@ -105,7 +105,7 @@ class _Columns:
 
     def add(self, values: np.ndarray, differences: bool = False) -> int:
         """Add values (n, width) and return their number; differences of consecutive rows may compress better."""
-        values = np.ascontiguousarray(values.reshape(len(values), -1))
+        values = np.ascontiguousarray(values.reshape(len(values), int(np.prod(values.shape[1:]))))     # may be empty
         rows, width = values.shape
         if differences:
             # zigzag code: differences 0, -1, 1, -2, ... become 0, 1, 2, 3, ..., small numbers that compress well

@@ -2,16 +2,20 @@
 from __future__ import annotations
 
 import json
+import warnings
+from collections import Counter
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from scanprep.geometry import format_glb as glb
 from scanprep.geometry import storage
 from scanprep.geometry.format_common import MeshFileError
 from scanprep.geometry.mesh import Mesh
+from scanprep.repair.hole_filling import close
 from scanprep.skeleton.tree import Skeleton
 
 from ...blend_weights import strongest
@@ -19,6 +23,8 @@ from ...rig import turn_up
 from .chart import Chart, automatic_chart, chart_problem
 from .model import ControlModel, control_problem, surface_problem
 
+# share of the surface that the largest component must have: eyes, teeth and claws have a tenth, a second body a half
+LEAST = 0.7
 KIND, VERSION = "control model", 1
 STORED = Path(__file__).with_name("humanoid.npz")           # made by tests/humanoid_maker.py
 
@@ -81,21 +87,31 @@ def _read_skinned(path: Path) -> ControlModel:
     data = storage.read_bytes(path, what, MeshFileError)
     tree, binary = glb.chunks_of(path, data)
     with storage.taking_apart(path, what, MeshFileError):
-        # the one node with a mesh on joints, and its skin
+        # the nodes with a mesh on joints; one skin may move several meshes, such as body and eyes
         nodes = list(glb.nodes_of(tree))
         skinned = [node for _, node, _ in nodes if "mesh" in node and "skin" in node]
-        if len(skinned) != 1:
+        sizes = Counter[int]()
+        for node in skinned:
+            sizes[node["skin"]] += sum(glb.item(tree["accessors"], primitive["attributes"]["POSITION"])["count"]
+                                       for primitive in glb.item(tree["meshes"], node["mesh"])["primitives"])
+        if not sizes or max(sizes.values()) < LEAST * sizes.total():
             names = ", ".join(str(node.get("name", "unnamed")) for node in skinned)
             meshes = sum("mesh" in node for _, node, _ in nodes)
             raise ValueError(f"found {len(skinned)} meshes that hang on joints{f' ({names})' if names else ''}, "
-                             f"{meshes} meshes in all")
-        skin = glb.item(tree["skins"], skinned[0]["skin"])
+                             f"{meshes} meshes in all; expected those of one skeleton")
+        main = max(sizes, key=sizes.__getitem__)
+        aside = [str(node.get("name", "unnamed")) for node in skinned if node["skin"] != main]
+        if aside:
+            warnings.warn(f"{path}: left out {', '.join(aside)}, which hang on another skeleton", stacklevel=2)
+        skinned, skin = [node for node in skinned if node["skin"] == main], glb.item(tree["skins"], main)
         places = {number: matrix for number, _, matrix in nodes}
         joints = skin["joints"]
         # its surface in the pose of the file
         motion = glb.joint_matrices(tree, binary, skin, places)
         joint_places = np.stack([places[number] for number in joints])[:, :3, 3]
-        points, weights, uv, faces = _corners(tree, binary, glb.item(tree["meshes"], skinned[0]["mesh"]), len(joints))
+        whole = {"primitives": [primitive for node in skinned
+                                for primitive in glb.item(tree["meshes"], node["mesh"])["primitives"]]}
+        points, weights, uv, faces = _corners(tree, binary, whole, len(joints))
         points = glb.apply_skin(points, weights, motion)
         if not np.isfinite(points).all():
             raise ValueError(f"{(~np.isfinite(points).all(axis=1)).sum()} vertices are not finite")
@@ -107,7 +123,7 @@ def _read_skinned(path: Path) -> ControlModel:
             while up is not None and up not in joints:
                 up = above.get(up)
             parents.append(-1 if up is None else joints.index(up))
-        return _control(_weld(points, weights, uv, faces), joint_places, np.array(parents),
+        return _control(path, _weld(points, weights, uv, faces), joint_places, np.array(parents),
                         [str(glb.item(tree["nodes"], number).get("name", f"joint{number}")) for number in joints])
 
 
@@ -132,21 +148,22 @@ def _corners(tree: dict[str, Any], binary: bytes, mesh: dict[str, Any], joints: 
         weights.append(glb.weights_of(tree, binary, primitive, joints))
         faces.append(own + start)
         start += count
-    if 0 < len(uv) < len(points):
-        raise ValueError("some of its primitives have texture coordinates and some have none")
-    return (np.concatenate(points), np.concatenate(weights), np.concatenate(uv) if uv else None,
+    return (np.concatenate(points), np.concatenate(weights), np.concatenate(uv) if len(uv) == len(points) else None,
             np.concatenate(faces))
 
 
-def _control(surface: tuple[Mesh, np.ndarray, Chart | None], places: np.ndarray, parents: np.ndarray, names: list[str]
-             ) -> ControlModel:
-    mesh, weights, chart = surface
+def _control(path: Path, surface: tuple[Mesh, np.ndarray, Chart | None], places: np.ndarray, parents: np.ndarray,
+             names: list[str]) -> ControlModel:
+    whole, weights, chart = surface
+    mesh, weights = _one_surface(path, whole, weights)
+    chart = chart if mesh is whole else None
     problem = surface_problem(mesh)
     if problem:
         raise ValueError(f"not usable as a control mesh: {problem}")
     problem = chart_problem(mesh, chart) if chart else None
     if problem:
-        raise ValueError(f"its texture coordinates are not usable: {problem}; without any, a chart is made")
+        warnings.warn(f"{path}: a chart is made for the images, its own is not usable: {problem}", stacklevel=2)
+        chart = None
     up = turn_up(2)                                                    # z up, as the people
     mesh, places = mesh.with_vertices(mesh.vertices @ up), places @ up
     kept, parents, weights, part_of_face = _with_triangles(mesh, weights, parents)
@@ -158,6 +175,28 @@ def _control(surface: tuple[Mesh, np.ndarray, Chart | None], places: np.ndarray,
     problem = control_problem(control)
     assert problem is None, problem
     return control
+
+
+def _one_surface(path: Path, mesh: Mesh, weights: np.ndarray) -> tuple[Mesh, np.ndarray]:
+    """Keep the largest part of a mesh, closed and manifold, with the weights of the nearest vertices; say what changed.
+
+    Small parts such as eyes and teeth are left out: where the figure has them, they are in the detail.
+    """
+    if surface_problem(mesh) is None:
+        return mesh, weights
+    part = mesh.vertex_component[mesh.faces[:, 0]]
+    areas = np.bincount(part, mesh.face_areas)
+    share = areas.max() / areas.sum()
+    if share < LEAST:
+        raise ValueError(f"not usable as a control mesh: it has {(areas > 0).sum()} components, the largest is "
+                         f"{100 * share:.0f}% of the surface; join them into one surface, with Blender for example")
+    body = close(mesh.submesh(part == areas.argmax())[0])
+    body = body if body.volume > 0 else Mesh(body.vertices, np.ascontiguousarray(body.faces[:, ::-1]))
+    others = (areas > 0).sum() - 1
+    left = f"left out {others} small components such as eyes" if others else "its surface was repaired and closed"
+    warnings.warn(f"{path}: {left}; {len(body.faces)} of {len(mesh.faces)} triangles make the control mesh",
+                  stacklevel=2)
+    return body, weights[cKDTree(mesh.vertices).query(body.vertices)[1]]
 
 
 def _weld(points: np.ndarray, weights: np.ndarray, uv: np.ndarray | None, corners: np.ndarray

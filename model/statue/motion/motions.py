@@ -186,15 +186,18 @@ class BoundControl:
         return np.asarray(self._bind @ body + np.einsum("nab,nb->na", R, self._offset))
 
 
-def bind_points(mesh: Mesh, body: Mesh) -> csr_array:
-    """Bind each control vertex to a body point with a compatible normal: barycentric weights (n, N)."""
+def bind_points(mesh: Mesh, body: Mesh, farthest: float = np.inf) -> csr_array:
+    """Bind each vertex to a body point with a compatible normal: barycentric weights (n, N).
+
+    Where none is within `farthest`, metres, it is the nearest point: the inside of a sleeve faces no body.
+    """
     close = Surface(body).closest(mesh.vertices)
     corners, weights = body.faces[close.faces].copy(), close.bary.copy()
     facing = np.einsum("nd,nd->n", np.einsum("nc,ncd->nd", weights, body.vertex_normals[corners]), mesh.vertex_normals)
     wrong = np.flatnonzero(facing < 0.3)       # the nearest triangle is of another limb or side
     if len(wrong):
         there = OrientedPoints(body.vertices, body.vertex_normals)
-        found = there.match(mesh.vertices[wrong], mesh.vertex_normals[wrong], min_cosine=0.3)
+        found = there.match(mesh.vertices[wrong], mesh.vertex_normals[wrong], farthest, 0.3)
         wrong, vertex = wrong[found.valid], found.index[found.valid]
         corners[wrong], weights[wrong] = vertex[:, None], [1, 0, 0]
     n = len(mesh.vertices)
