@@ -20,6 +20,7 @@ from scanprep.folders import FolderCommand, do_one, figure
 from scanprep.geometry.files import write_mesh
 from scanprep.geometry.format_common import UNITS
 from scanprep.geometry.mesh import Mesh
+from scanprep.geometry.sanitise import sanitise
 from scanprep.judgement import Judgement
 from scanprep.pictures.gltf import write_animated_glb
 from scanprep.pictures.sheets import save_png, write_gif
@@ -50,14 +51,14 @@ from .detail.texels import bake_texture, scan_look
 from .files import BODY, body_model, load_statue, save_statue, write_body, write_for_programs, write_statue_glb
 from .fit import FittedStatue, StatueConfig, fit_statue
 from .motion.motions import follower_of, read_statue_motion, write_body_motion
-from .outer import cut_plinth, keep_outer
+from .outer import cut_plinth, find_plinth, keep_outer
 from .registration.automatic import guess_person_unit
 from .registration.clicks import read_features
 from .report import in_motion, motion_pictures, parts_without_data, statue_page, statue_picture
 from .verdict import judge_statue
 
 LEFT_BY_MAP = "error left by the map where it is one-to-one, mean"
-SPLIT = 60        # longest side of triangles in the height of a figure: 3 cm on a person, as near as floors are to soles
+SPLIT = 60        # longest side of triangles in the height of a figure: 3 cm on a person, as floors are near soles
 FINE = StatueConfig(displacement=DisplacementConfig(size=2048))
 
 
@@ -80,7 +81,7 @@ def fit(scan: ScanArg, output: Output, features: Path | None = None, control: Pa
         unit: Unit of the scan and the features; "unknown": it is found together with the person. Else metres with
             --features, and without them that in which the body would be as tall as a person.
         cut: Height of a plinth above the lowest point of the scan, in the numbers of its file; what lies below is left
-            out. Up is the axis along which the scan is longest.
+            out. Up is the axis along which the scan is longest. Else a plinth is found where it is a clear block.
         workers: Who fits the scans of a folder.
     """
     work = Work(humanoid() if control is None else read_control(control), config, unit, cut)
@@ -194,9 +195,10 @@ def read_scan(inputs: ScanTask, unit: str | None, cut: float | None = None
         rows.append(Metric("inside the surface, left out", 100 * inside, "% of the surface"))
     # what follows looks at vertices: a plinth of twelve triangles needs more of them
     scan = split_long_sides(scan, float(np.ptp(scan.vertices, axis=0).max(initial=0)) / SPLIT)
-    if cut is not None:
-        scan, cut_off = cut_plinth(scan, cut * UNITS[unit or "m"])
-        rows.append(Metric("below --cut, left out", 100 * cut_off, "% of the surface"))
+    plinth = find_plinth(sanitise(scan)) if cut is None else cut * UNITS[unit or "m"]
+    if plinth is not None:
+        scan, cut_off = cut_plinth(scan, plinth)
+        rows.append(Metric("plinth, left out", 100 * cut_off, "% of the surface"))
     metre = UNITS[guess_person_unit(scan.vertices)] if sought else 1.0
     cleaned = clean_scan(scan.with_vertices(metre * scan.vertices))
     doubts = cleaning_doubts(cleaned)
