@@ -95,6 +95,7 @@ def test_a_plinth_of_twelve_triangles_stays_behind_and_the_soles_stay(person, tm
     assert any(row.name == "plinth, left out" for row in rows)
 
 
+@pytest.mark.slow
 def test_flat_faces_of_a_figure_of_boxes_stay(tmp_path):
     """Sides of a box-shaped head were taken for walls."""
     parts = [box((0, 0, 1.35), (0.7, 0.7, 0.7)), box((0, 0, 0.75), (0.5, 0.3, 0.52)),
