@@ -80,5 +80,43 @@ def test_triangles_may_be_long_and_unwelded(person):
 def test_reading_a_scan_says_what_was_left_out(person, tmp_path):
     write_mesh(tmp_path / "scan.ply", join(person.mesh, *teeth(person)))
     body, _, rows, _ = read_scan(ScanTask("scan", tmp_path / "scan.ply"), None)
-    assert len(body.faces) == len(person.mesh.faces)
+    assert body.face_areas.sum() == pytest.approx(person.mesh.face_areas.sum())
     assert [row.value for row in rows if row.name == "inside the surface, left out"] == [pytest.approx(0.11, abs=0.05)]
+
+
+@pytest.mark.parametrize(("cut", "width", "height"), [(None, 0.6, 0.15), (None, 0.45, 0.3), (0.08, 0.5, 0.08)])
+def test_a_plinth_of_twelve_triangles_stays_behind_and_the_soles_stay(person, tmp_path, cut, width, height):
+    """It became two feet: eight vertices are no floor."""
+    body = person.mesh.with_vertices(person.mesh.vertices - [0, 0, person.mesh.vertices[:, 2].min()])
+    write_mesh(tmp_path / "scan.ply", join(body, box((0, 0, -height / 2), (width, width, height))))
+    found, _, rows, _ = read_scan(ScanTask("scan", tmp_path / "scan.ply"), None, cut)
+    assert -0.001 < found.vertices[:, 2].min() < 0.005        # metres
+    assert found.face_areas.sum() == pytest.approx(body.face_areas.sum(), rel=0.03)
+    assert any(row.name == "plinth, left out" for row in rows)
+
+
+@pytest.mark.slow
+def test_flat_faces_of_a_figure_of_boxes_stay(tmp_path):
+    """Sides of a box-shaped head were taken for walls."""
+    parts = [box((0, 0, 1.35), (0.7, 0.7, 0.7)), box((0, 0, 0.75), (0.5, 0.3, 0.52)),
+             *(box((x, 0, 0.25), (0.22, 0.3, 0.5)) for x in (-0.13, 0.13)),
+             *(box((x, 0, 0.8), (0.16, 0.2, 0.45)) for x in (-0.33, 0.33))]
+    figure = join(*parts)
+    write_mesh(tmp_path / "scan.ply", figure)
+    body, *_ = read_scan(ScanTask("scan", tmp_path / "scan.ply"), None)
+    assert (np.ptp(body.vertices, axis=0) == pytest.approx(np.ptp(figure.vertices, axis=0)))
+    assert body.face_areas.sum() > 0.9 * figure.face_areas.sum()
+
+
+def test_box_shaped_shoes_are_no_plinth(person, tmp_path):
+    """Their soles were taken for a floor: no vertex of the shoes lay near them."""
+    shoes = [box((x, -0.05, 0.06), (0.16, 0.42, 0.12)) for x in (-0.19, 0.19)]
+    write_mesh(tmp_path / "scan.ply", join(person.mesh, *shoes))
+    body, _, rows, _ = read_scan(ScanTask("scan", tmp_path / "scan.ply"), None)
+    assert body.vertices[:, 2].min() == pytest.approx(0) and not any("plinth" in row.name for row in rows)
+
+
+def test_a_cut_above_the_figure_is_refused(person, tmp_path):
+    write_mesh(tmp_path / "scan.ply", person.mesh)
+    with pytest.raises(ValueError, match="cut: expected a height below that of the scan"):
+        read_scan(ScanTask("scan", tmp_path / "scan.ply"), None, 2.5)

@@ -23,6 +23,7 @@ from scanprep.geometry.landmark_names import FACE
 from scanprep.geometry.landmark_writing import CLICKED_JOINTS
 from scanprep.geometry.landmarks import write_landmarks
 from scanprep.geometry.mesh import Mesh
+from scanprep.geometry.sanitise import sanitise
 from scanprep.judgement import Judgement
 from scanprep.pictures.gltf import write_animated_glb
 from scanprep.pictures.sheets import save_png, write_gif
@@ -54,7 +55,7 @@ from .detail.texels import bake_texture, scan_look
 from .files import BODY, body_model, load_statue, save_statue, write_body, write_for_programs, write_statue_glb
 from .fit import FittedStatue, StatueConfig, UnplacedError, fit_statue
 from .motion.motions import follower_of, read_statue_motion, write_body_motion
-from .outer import cut_plinth, keep_outer
+from .outer import cut_plinth, find_plinth, keep_outer
 from .own_mesh import OWN_MESH, animate_own_mesh, write_own_mesh
 from .registration.automatic import person_unit
 from .registration.clicks import read_features
@@ -63,7 +64,7 @@ from .verdict import judge_statue
 
 FEATURES = "features.json"           # joints and points of the face of a statue, to be mended in scape pick --joints
 LEFT_BY_MAP = "error left by the map where it is one-to-one, mean"
-SPLIT = 60        # longest side of triangles in the height of a figure: 3 cm on a person, as near as floors are to soles
+SPLIT = 60        # longest side of triangles in the height of a figure: 3 cm on a person, as floors are near soles
 FINE = StatueConfig(displacement=DisplacementConfig(size=2048))
 
 
@@ -86,7 +87,7 @@ def fit(scan: ScanArg, output: Output, features: Path | None = None, control: Pa
         unit: Unit of the scan and the features; "unknown": it is found together with the person. Else that in which
             the body would be as tall as a person, and metres with --control.
         cut: Height of a plinth above the lowest point of the scan, in the numbers of its file; what lies below is left
-            out. Up is the axis along which the scan is longest.
+            out. Up is the axis along which the scan is longest. Else a plinth is found where it is a clear block.
         own_mesh: Write own.glb too: the file's own vertices, materials and textures on the skeleton.
         names: Whose names the bones of own.glb have: mixamo, unity, unreal, vrm, h-anim or opensim.
         workers: Who fits the scans of a folder.
@@ -243,9 +244,10 @@ def read_scan(inputs: ScanTask, unit: str | None, person: bool = True, cut: floa
         rows.append(Metric("inside the surface, left out", 100 * inside, "% of the surface"))
     # what follows looks at vertices: a plinth of twelve triangles needs more of them
     scan = divide_long_edges(scan, float(np.ptp(scan.vertices, axis=0).max(initial=0)) / SPLIT)
-    if cut is not None:
-        scan, cut_off = cut_plinth(scan, cut * metres_of(unit))
-        rows.append(Metric("below --cut, left out", 100 * cut_off, "% of the surface"))
+    plinth = find_plinth(sanitise(scan)) if cut is None else cut * metres_of(unit)
+    if plinth is not None:
+        scan, cut_off = cut_plinth(scan, plinth)
+        rows.append(Metric("plinth, left out", 100 * cut_off, "% of the surface"))
     metre = person_unit(scan.vertices)[0] if sought else 1.0
     cleaned = clean_scan(scan.with_vertices(metre * scan.vertices))
     doubts = cleaning_doubts(cleaned)

@@ -2,7 +2,7 @@
 from __future__ import annotations
 
 import numpy as np
-from scipy.spatial import cKDTree
+from scipy.spatial import ConvexHull, cKDTree
 
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.sparse import label_components
@@ -67,13 +67,36 @@ def keep_outer(scan: Mesh) -> tuple[Mesh, float]:
     return (scan.submesh(~inside)[0], left_out) if left_out else (scan, 0.0)
 
 
+def find_plinth(scan: Mesh) -> float | None:
+    """Find the height of a plinth: a wide block with a flat top under the feet; None where there clearly is none.
+
+    Triangles face outward (`sanitise`), and their sides are short. Up is the longest axis.
+    """
+    size = np.ptp(scan.vertices, axis=0)
+    axis, height = int(size.argmax()), float(size.max())
+    centres, low = scan.corners.mean(axis=1), scan.vertices[:, axis].min()
+    rise = centres[:, axis] - low
+    # a plinth is 1% to 25% of the whole (legs of boxes end at 29%), and its top a layer of 0.5%
+    top = np.flatnonzero((scan.face_normals[:, axis] > 0.98) & (rise > 0.01 * height) & (rise < 0.25 * height))
+    layer, of = np.unique(np.round(rise[top] / (0.005 * height)), return_inverse=True)
+    area = np.bincount(of, scan.face_areas[top], len(layer))
+    if not len(layer) or area.max() < 0.015 * height**2:           # soles are 0.013, plinths of 0.4 m 0.04
+        return None
+    level = float(np.median(rise[top][of == area.argmax()]))
+    below = np.delete(scan.vertices[scan.vertices[:, axis] <= low + level + 1e-3 * height], axis, axis=1)
+    # what is seen of its top, in shares of its outline: plinths have 0.8, two shoes that are boxes 0.5
+    return level if area.max() > 0.6 * ConvexHull(below).volume else None
+
+
 def cut_plinth(scan: Mesh, height: float) -> tuple[Mesh, float]:
     """Leave out what lies lower than `height` above the lowest point, along the longest axis; also return its share.
 
-    ValueError where nothing would be left.
+    What is level with the cut is the top of the plinth. ValueError where nothing would be left.
     """
     level = scan.vertices[:, np.ptp(scan.vertices, axis=0).argmax()]
-    above = (level >= level.min() + height)[scan.faces].all(axis=1)
+    rise = (level - level.min())[scan.faces]
+    step = 0.002 * float(np.ptp(level))                            # 3 mm on a person: the top need not be quite level
+    above = (rise >= height - step).all(axis=1) & (rise > height + step).any(axis=1)
     if not above.any():
         raise ValueError(f"cut: expected a height below that of the scan, {np.ptp(level):.3g}, got {height:.3g}")
     return scan.submesh(above)[0], float(scan.face_areas[~above].sum() / scan.face_areas.sum())

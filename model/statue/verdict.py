@@ -44,10 +44,10 @@ def judge_statue(statue: FittedStatue, scan: Mesh, finest: Level, left_out: Sequ
                       "given by hand (--features) may help")
     elif shares["folded"] > most_folded or shares["measured"] < 0.75:
         check.append(f"{summary}; clothes and hair, a part of a person, or joints in wrong places: look at the page")
-    # share of the scan's area: right figures have up to 0.01, an arm on the trunk 0.02, upside down 0.11
-    points = scan.sample(10_000, np.random.default_rng(0))[0]
-    missed = float((Surface(finest.mesh).closest(points).distances > MISSED * height).mean())
-    if missed > 0.02:
+    missed = share_missed(scan, finest.mesh, MISSED * height)
+    # right figures have up to 0.002, one with hair over its shoulders 0.05, in a wide skirt 0.10; an arm on the trunk
+    # has 0.02, upside down 0.11
+    if missed > (0.015 if rig else 0.06):
         (failed if missed > 0.25 else check).append(
             f"{100 * missed:.0f}% of the scan lies off the statue: joints in wrong places, or more than a person?")
     # mean distance, shares of the height: right figures have 0.0001, in loose clothes 0.001; an arm on the trunk 0.0014
@@ -64,6 +64,21 @@ def judge_statue(statue: FittedStatue, scan: Mesh, finest: Level, left_out: Sequ
     check += [f"the scan has no data on {', '.join(lacking[:NAMED])}"] if lacking else []
     check += [posed.problem] if posed.problem else []
     return Judgement.of(failed, check)
+
+
+def share_missed(scan: Mesh, surface: Mesh, far: float) -> float:
+    """Compute the share of a scan's area that lies outside a closed surface, and farther than `far` metres from it.
+
+    Linings of sleeves and shoes lie inside.
+    """
+    import igl
+
+    points = scan.sample(10_000, np.random.default_rng(0))[0]
+    off = points[Surface(surface).closest(points).distances > far]
+    if not len(off):
+        return 0.0
+    within = np.asarray(igl.fast_winding_number(surface.vertices, surface.faces, off)).ravel() > 0.5
+    return float((~within).sum() / len(points))
 
 
 def find_unseen(statue: FittedStatue) -> list[str]:

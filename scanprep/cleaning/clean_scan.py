@@ -231,16 +231,17 @@ def _without_planes(mesh: Mesh, link: float, config: CleanScanConfig, landmarks:
 def _is_face_of_body(mesh: Mesh, off: np.ndarray) -> bool:
     """Test whether points (n,) on a plane are a flat face of the body, as a sole or the side of a box-shaped head.
 
-    Such a face goes on into the body all around. A floor and a pedestal touch it at the feet only.
+    Such a face goes on into the body all around. A floor and a pedestal touch it at the feet only, and floors end.
     """
     chosen = np.zeros(len(mesh.vertices), dtype=bool)
     chosen[off] = True
     inside = chosen[mesh.faces].all(axis=1)
-    pair = mesh.face_pairs[inside[mesh.face_pairs].sum(axis=1) == 1]
-    shared = mesh.face_edges[pair[:, 0]][(mesh.face_edges[pair[:, 0], :, None] == mesh.face_edges[pair[:, 1], None]
-                                          ).any(axis=2)]
-    # length of the rim in roots of its area: a square has 4, soles 4 to 6, floors and pedestals under people 0.3 to 1.7
-    return bool(mesh.edge_lengths[shared].sum() > 3 * np.sqrt(mesh.face_areas[inside].sum())) and bool(len(shared))
+    within = np.bincount(mesh.face_edges[inside].ravel(), minlength=len(mesh.edges))
+    rim, ends = (float(mesh.edge_lengths[(within == 1) & shared].sum())
+                 for shared in (mesh.edge_use > 1, mesh.edge_use == 1))
+    # length of the rim in roots of its area: a square has 4, soles 4 to 6, the front of a box-shaped head 2.7, floors
+    # and pedestals under people 0.3 to 1.7
+    return rim > 2.2 * float(np.sqrt(mesh.face_areas[inside].sum())) and ends < 0.25 * rim
 
 
 def label_pieces(mesh: Mesh, chosen: np.ndarray, link: float) -> np.ndarray:
