@@ -275,7 +275,7 @@ def test_a_refused_figure_opens_with_what_was_found_and_may_be_fitted_there(pers
         told = " ".join(capsys.readouterr().err.split())
         start = f" --start {output}/.scapekit/refused/anna.json" if found else ""
         assert f"nobody; click its joints: scape pick {scan} --joints{start}, then fit it with --features" in told
-    start = read_landmarks(output / ".scapekit" / "refused" / "anna.json")
+    start = read_landmarks(output / ".scapekit" / "refused" / "anna.json", unit="m")
     np.testing.assert_allclose(start["l_elbow"], 1000 * joints["l_elbow"])
     (tmp_path / "few.json").write_text(json.dumps({"l_elbow": [0, 0, 1]}))
     assert run("fit", scan, "-o", output, "--features", tmp_path / "few.json") == 1

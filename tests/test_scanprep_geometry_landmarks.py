@@ -3,6 +3,7 @@ import json
 
 import numpy as np
 import pytest
+import trimesh
 
 from scanprep.decimation.decimate import decimate
 from scanprep.geometry.files import MeshFileError, write_mesh
@@ -376,3 +377,13 @@ def test_axes_that_a_slicer_file_tells_are_doubted_only_where_the_others_fit_far
         turned = body.with_vertices(body.vertices * [-1, -1, 1])            # a scan that was saved in RAS
         found = read_landmarks(tmp_path / "a.mrk.json", turned)
         assert all(np.allclose(found[name], point * [-1, -1, 1], atol=1e-6) for name, point in points.items()), seed
+
+
+def test_joints_inside_a_thick_body_keep_their_unit(tmp_path):
+    """4% of the body's size below its surface; as inches for centimetres they would be nearer to it, in one corner."""
+    body = trimesh.creation.box(bounds=[[0, 0, 0], [1, 1, 1]])
+    joints = {str(k): np.array([0.07, y, 0.5 + 0.4 * (-1) ** k]) for k, y in enumerate(np.linspace(0.1, 0.95, 9))}
+    write_landmarks(tmp_path / "a.json", joints)
+    found = read_landmarks(tmp_path / "a.json", Mesh(body.vertices, body.faces))
+    for name, place in joints.items():
+        np.testing.assert_allclose(found[name], place)

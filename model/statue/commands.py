@@ -104,8 +104,8 @@ def fit(scan: ScanArg, output: Output, features: Path | None = None, control: Pa
                              f"{', '.join(work.control.skeleton.names)}")
         return do_one("fitting the statue", space, work, Task("statue", ScanTask("statue", scan, features)),
                       {"statue": config}, f"open {quote(str(output / 'report.html'))}; if joints are in wrong places: "
-                      f"{_pick(scan, output / FEATURES)}; a BVH file of yours moves it: scape statue animate "
-                      f"{quote(str(output))} walk.bvh -o walking")
+                      f"scape pick {quote(str(scan))} --joints --start {quote(str(output / FEATURES))}; "
+                      f"a BVH file of yours moves it: scape statue animate {quote(str(output))} walk.bvh -o walking")
     if features is not None and not features.is_dir():
         raise UsageError(f"--features: expected a folder for a folder of scans, got {features}")
     tasks = [Task(one.name, one if features else replace(one, landmarks=None), one.name)
@@ -173,7 +173,9 @@ class Work:
 
 def _pick(scan: Path, start: Path | None = None) -> str:
     """Return the command that opens a scan to click its joints, beginning with those of a file."""
-    return f"scape pick {quote(str(scan))} --joints" + (f" --start {quote(str(start))}" if start else "")
+    if start is None:
+        return f"scape pick {quote(str(scan))} --joints"
+    return f"scape pick {quote(str(scan))} --joints --start {quote(str(start))}"
 
 
 def features_of(statue: FittedStatue) -> dict[str, np.ndarray]:

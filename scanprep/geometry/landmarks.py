@@ -314,8 +314,18 @@ def _metres_on_surface(path: Path, points: np.ndarray, scan: Mesh | np.ndarray, 
         spread = float(np.linalg.norm(np.ptp(points * scale, axis=0)))      # a single spot would always fit
         return spread > 0.2 * size and away(scale) <= 0.03 * size
 
+    def fills(scale: np.ndarray) -> bool:
+        """Test whether the points lie among those of the scan and over half of it, as joints inside a body do.
+
+        Neighbouring units differ by 2.5, and such points would leave the scan in another unit or lie in a corner of it.
+        """
+        places, room = points * scale, 0.03 * size
+        spread = float(np.linalg.norm(np.ptp(places, axis=0)))
+        low, high = of_scan.min(axis=0) - room, of_scan.max(axis=0) + room
+        return spread > 0.5 * size and bool(((places >= low) & (places <= high)).all())
+
     best = min((stated * sign for sign in signs), key=misfit)
-    if len(points) < 3 or fits(best):
+    if len(points) < 3 or fits(best) or fills(best):
         return best
     # try every ratio of two units: either the scan or the landmarks may have been converted
     factors = {a / b for a in UNITS.values() for b in UNITS.values()}

@@ -101,7 +101,9 @@ class Clickable:
         origin, direction = (np.asarray(v, dtype=float) for v in (origin, direction))
         direction = direction / np.linalg.norm(direction)
         size = float(np.ptp(self.points, axis=0).max())
-        points, depth, depths = [], 0, []
+        depth = 0
+        points: list[np.ndarray] = []
+        depths: list[int] = []
         while len(points) < MOST_CROSSINGS and (crossing := self._crossing(origin, direction)) is not None:
             depth += 1 if crossing[1] else -1
             points.append(crossing[0])
