@@ -83,7 +83,7 @@ def split_long_sides(mesh: Mesh, longest: float) -> Mesh:
     """Divide triangles until no side is longer than `longest`, metres; the surface stays as it is, without a crack."""
     if mesh.edge_lengths.max(initial=0) <= longest:
         return mesh
-    mesh = mesh.submesh(slice(None))[0]                     # without unused vertices
+    mesh = mesh.submesh(np.arange(len(mesh.faces)))[0]                  # without unused vertices
 
     def find_long(now: _Corners) -> np.ndarray:
         corners = np.einsum("fkc,fcd->fkd", now.bary, mesh.corners[now.parent])
