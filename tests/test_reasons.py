@@ -42,7 +42,7 @@ SAID_BY = {
     "completion/tracking/folder.py _by_pattern": "track",
     "completion/tracking/sequence.py tracking_problem": "track",
     "model/coregistration/lead.py model_lead": "prep register, prep run",
-    "model/statue/commands.py judge_statue": "statue fit",
+    "model/statue/verdict.py judge_statue": "statue fit",
     "model/statue/motion/motions.py read_statue_motion": "statue animate",
     "model/statue/motion/motions.py follower_of": "statue animate",
     "scanprep/alignment/views.py views_problem": "prep views",

@@ -111,7 +111,7 @@ def rig_doubts(statue: FittedStatue, surface: Mesh) -> list[str]:
 
     control, names = statue.control, statue.control.skeleton.names
     at = dict(zip(names, control.skeleton.joints, strict=True))
-    left, front = body_axes(control)
+    left, front = side_and_front(control)
     doubts = []
     within = np.asarray(igl.fast_winding_number(surface.vertices, surface.faces, control.skeleton.joints)).ravel() > 0.5
     outside = [in_words(names[j]) for j in range(1, len(names)) if not within[j]]
@@ -147,7 +147,7 @@ def rig_doubts(statue: FittedStatue, surface: Mesh) -> list[str]:
     return doubts
 
 
-def body_axes(control: ControlModel) -> tuple[np.ndarray, np.ndarray]:
+def side_and_front(control: ControlModel) -> tuple[np.ndarray, np.ndarray]:
     """Compute unit vectors (3,) to the left and to the front of a humanoid, by its hips and the base of its skull."""
     at = dict(zip(control.skeleton.names, control.skeleton.joints, strict=True))
     left = at["l_hip"] - at["r_hip"]
@@ -157,5 +157,5 @@ def body_axes(control: ControlModel) -> tuple[np.ndarray, np.ndarray]:
 
 def inward(control: ControlModel) -> np.ndarray:
     """Compute unit vectors (J, 3) from each left part to the right and back; zero for the others."""
-    names, left = control.skeleton.names, body_axes(control)[0]
+    names, left = control.skeleton.names, side_and_front(control)[0]
     return np.array([{"l": -1, "r": 1}.get(name[0] if name[1] == "_" else "", 0) * left for name in names])

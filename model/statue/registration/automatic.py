@@ -94,7 +94,7 @@ def why_uncertain(margin: float) -> str | None:
     """Explain why front and back may be exchanged; None where they are not. Distances are those of the finished statue.
     """
     return (None if margin >= DOUBTED_MARGIN else
-            f"facing another way it fits only {margin:.2f} times worse: look at it, or give joints by --features")
+            f"facing another way it fits only {margin:.2f} times worse: look at it, or click")
 
 
 def person_unit(points: np.ndarray) -> tuple[float, str]:
