@@ -16,6 +16,7 @@ from scanprep.registration.schedule import RegistrationConfig
 from scanprep.threads import one_thread, search_threads
 from scanprep.words import number_of
 
+from ...body import Progress
 from ..control.model import ControlModel
 from .features import FeatureFit, fit_features
 from .person_search import find_stand
@@ -40,7 +41,7 @@ class Features:
 
 
 @one_thread()
-def find_features(control: ControlModel, scan: Mesh) -> Features:
+def find_features(control: ControlModel, scan: Mesh, progress: Progress | None = None) -> Features:
     """Find joint centres and landmarks of a person who stands upright, by a humanoid control model.
 
     Unit and axes of the scan need not be known. It may have holes, or show a part of a person. The control model, z up
@@ -60,7 +61,7 @@ def find_features(control: ControlModel, scan: Mesh) -> Features:
         return Features({}, {}, (*control.skeleton.names, *control.landmarks), None, None, problem)
     placed = data.with_vertices(metres * data.vertices) if isinstance(data, Mesh) else metres * data
     result = register(best.mesh, placed, config=RegistrationConfig(graph=RegistrationConfig().graph[-2:]),
-                      start=np.eye(4))
+                      start=np.eye(4), progress=progress)
     joints, points, missing = _features(control, result, placed, metres)
     fit = fit_features(control, joints, points) if len(joints) + len(points) > 2 else None
     registered = control.mesh.with_vertices(result.mesh.vertices / metres)
