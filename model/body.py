@@ -26,6 +26,22 @@ Model = TypeVar("Model", bound="BodyModel")
 VERSION = 3                          # of model files: 1 and 2 had fewer kinds of features, or no pose examples
 
 
+def share_progress(progress: Progress | None, begin: int, end: int) -> Progress | None:
+    """Make the callback of a stage that takes a bar from `begin` to `end` percent, and move the bar to its begin.
+
+    Examples
+    --------
+    >>> half = share_progress(lambda done, total: print(f"{done} of {total}"), 50, 100)
+    50 of 100
+    >>> half(1, 2)
+    75 of 100
+    """
+    if progress is None:
+        return None
+    progress(begin, 100)
+    return lambda done, total: progress(begin + (end - begin) * done // max(total, 1), 100)
+
+
 @dataclass(frozen=True, eq=False)
 class Derivatives:
     """Vertices (L, 3), metres, with derivatives by the pose (L, 3, 3J), metres per radian, and the betas (L, 3, k).

@@ -4,27 +4,36 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from model_bodies import worm, worm_model
+from quiet_pictures import small_pictures  # noqa: F401 -- fixture
 
+from completion.__main__ import main
+from completion.motion import Motion
+from completion.viewing.files import Files
 from model.export.bvh import write_bvh
 from model.features import linear_features
 from model.motion.bvh import read_bvh
+from model.motion.files import skeleton_arrays
 from model.motion.moving import MovingSkeleton
 from model.motion.onto import read_motion
 from model.rig import joint_places
 from model.skinning import SkinningModel
 from model.statue.control.files import humanoid
+from model.statue.control.model import MEASURED, DisplacementMap, Statue
+from model.statue.files import save_statue
 from model.statue.motion.motions import (
     BoundControl,
     bind_points,
     bvh_motion,
     own_motion,
     people_motion,
+    read_statue_motion,
     write_body_motion,
 )
 from scanprep.geometry import rotations
 from scanprep.geometry.storage import StorageError
 from scanprep.geometry.surface import Surface
 from scanprep.skeleton.roles import find_roles, trunk
+from scanprep.skeleton.tree import Skeleton
 from scanprep.synthetic.people import PARTS, SyntheticPerson, find_pose, synthesise_walk
 
 GENERIC = np.zeros((17, 3))
@@ -311,3 +320,95 @@ def test_a_vertex_is_bound_to_its_own_side(learned):
     vertices[low, 2] += 0.8 * np.ptp(rest.vertices[:, 2])                # up through the body, still facing down
     bound = bind_points(squeezed.with_vertices(vertices), rest)[[low]]
     assert (bound @ rest.vertex_normals)[0, 2] < -0.3
+
+
+def statue_of(control, pose=GENERIC):
+    flat = DisplacementMap(np.zeros((16, 16), np.float32), np.full((16, 16), MEASURED, np.uint8))
+    return Statue(control, pose, flat)
+
+
+def humanoid_in_t_pose():
+    """The humanoid with level arms at rest, as a statue of a T-pose, and how its parts were turned."""
+    control = humanoid()
+    pose = people_motion(control, GENERIC, find_pose("t_pose")[None]).poses[0]
+    return control.refit(control.rig.vertices(pose), joint_places(control.skeleton, pose)), pose
+
+
+def upper_arms(control, motion):
+    """Directions (T, 2, 3) of the upper arms."""
+    places = joint_places(control.skeleton, motion.poses, motion.trans)
+    shoulders, elbows = ([NAMES.index(f"{side}_{joint}") for side in "lr"] for joint in ("shoulder", "elbow"))
+    bones = places[:, elbows] - places[:, shoulders]
+    return bones / np.linalg.norm(bones, axis=-1, keepdims=True)
+
+
+def test_a_motion_of_an_a_pose_statue_moves_one_in_t_pose_alike(tmp_path):
+    """Matched by the rest pose in the file: the arms hang as they did, and do not stand out at shoulder height."""
+    control, (other, pose) = humanoid(), humanoid_in_t_pose()
+    walk = people_motion(control, GENERIC, *synthesise_walk(12, 12), 12.0)
+    write_body_motion(tmp_path / "walk.npz", control, walk)
+    moved, doubts = read_statue_motion(statue_of(other, pose), tmp_path / "walk.npz")
+    cosine = (upper_arms(control, walk) * upper_arms(other, moved)).sum(axis=-1)
+    assert np.degrees(np.arccos(np.clip(cosine, -1, 1))).max() < 5 and not doubts
+    same, _ = read_statue_motion(statue_of(control), tmp_path / "walk.npz")
+    np.testing.assert_allclose(same.poses, walk.poses, atol=1e-9)
+
+
+def test_a_motion_of_a_model_with_other_parts_in_another_order_is_told_by_its_names(tmp_path):
+    """As the demo writes it: sixteen parts like the synthetic people's, but not in their order."""
+    person = SyntheticPerson()
+    poses, trans = synthesise_walk(12, 12)
+    wanted = people_motion(humanoid(), GENERIC, poses, trans, 12.0)
+    # the legs before the arms
+    order = [0, 1, 2, 3, *range(10, 16), *range(4, 10)]
+    parents = np.array([-1 if p < 0 else order.index(p) for p in person.skeleton.parents[order]])
+    names = [person.skeleton.names[j] for j in order]
+    skeleton = Skeleton(np.arange(16), parents, person.skeleton.joints[order], names)
+    motion = Motion(poses[:, order], trans, None, 12.0, np.zeros((12, 0)))
+    motion.save(tmp_path / "told.npz", **skeleton_arrays(skeleton))
+    moved, doubts = read_statue_motion(statue_of(humanoid()), tmp_path / "told.npz")
+    cosine = (upper_arms(humanoid(), wanted) * upper_arms(humanoid(), moved)).sum(axis=-1)
+    assert np.degrees(np.arccos(np.clip(cosine, -1, 1))).max() < 10 and not doubts
+    off = humanoid().rig.vertices(moved.poses, moved.trans) - humanoid().rig.vertices(wanted.poses, wanted.trans)
+    off -= off.mean(axis=(0, 1))
+    assert np.linalg.norm(off, axis=-1).mean() < 0.03
+    # without its skeleton it is refused, with the way
+    motion.save(tmp_path / "silent.npz")
+    with pytest.raises(StorageError, match=r"does not say which skeleton its 16 parts are of.*scape animate.*BVH"):
+        read_statue_motion(statue_of(humanoid()), tmp_path / "silent.npz")
+    np.savez(tmp_path / "plain.npz", poses=poses, trans=trans, mocap_frame_rate=12.0)
+    plain, doubts = read_statue_motion(statue_of(humanoid()), tmp_path / "plain.npz")
+    np.testing.assert_allclose(plain.poses, wanted.poses, atol=1e-9)
+    assert "one of the synthetic people by its 16 parts" in doubts[0]
+
+
+def test_a_damaged_skeleton_in_a_motion_is_named(tmp_path):
+    control = humanoid()
+    write_body_motion(tmp_path / "a.npz", control, people_motion(control, GENERIC, *synthesise_walk(3, 12), 12.0))
+    arrays = dict(np.load(tmp_path / "a.npz"))
+    np.savez(tmp_path / "b.npz", **{**arrays, "part_parents": arrays["part_parents"][::-1]})
+    with pytest.raises(StorageError, match=r"b\.npz.*parents"):
+        read_statue_motion(statue_of(control), tmp_path / "b.npz")
+
+
+def test_key_poses_move_a_statue_from_the_command_line(tmp_path, capsys):
+    save_statue(tmp_path / "statue", statue_of(humanoid()))
+    keys = tmp_path / "keys.csv"
+    keys.write_text("time,l_shoulder_rx,l_shoulder_ry,l_shoulder_rz,trans_z\n0,0,0,0,0\n1,0,-80,0,0.2\n")
+    words = ["statue", "animate", str(tmp_path / "statue"), str(keys), "-o", str(tmp_path / "out"), "--level", "0"]
+    assert main([*words, "--rate", "10"]) == 0
+    with np.load(tmp_path / "out" / "motion.npz") as stored:
+        assert stored["part_names"].tolist() == list(NAMES) and stored["poses"].shape == (11, 51)
+        np.testing.assert_allclose(np.degrees(stored["poses"].reshape(11, 17, 3)[5, NAMES.index("l_shoulder")]),
+                                   [0, -40, 0], atol=1e-4)
+        assert stored["trans"][-1, 2] == pytest.approx(0.2, abs=0.01)
+    # what was written opens in the viewer, on its own body
+    entry = Files((tmp_path / "out",)).entries()[0]
+    assert entry.kind == "motion" and entry.load().shapes
+    capsys.readouterr()
+    keys.write_text("time,upper_arm_left_rx\n0,0\n1,40\n")
+    assert main(words) == 1
+    assert "of the parts humanoid_root, vl5" in capsys.readouterr().err
+    keys.write_text("time,l_shoulder_rx\n0,0\n1,1.5\n")
+    assert main(words) == 0
+    assert "if the table has radians" in capsys.readouterr().err

@@ -191,7 +191,8 @@ def _quaternions(rig: Rig, poses: np.ndarray) -> np.ndarray:
     return continuous_quaternions(rig.local_rotations(poses))
 
 
-def add_animation(glb: Glb, rig: Rig, poses: np.ndarray, trans: np.ndarray, rate: float, targets: int) -> dict[str, Any]:
+def add_animation(glb: Glb, rig: Rig, poses: np.ndarray, trans: np.ndarray, rate: float, targets: int
+                  ) -> dict[str, Any]:
     """Add a motion of the joints\' nodes, in the axes of the rig; return its entry of `animations`."""
     q = _quaternions(rig, poses)
     times = glb.add(np.arange(len(poses)) / rate, "SCALAR", None, bounds=True)

@@ -70,8 +70,9 @@ def read_motion(path: str | Path, model: BodyModel, subject: Subject | None = No
                 rate: float | None = None) -> BodyMotion:
     """Read a motion file for a model: its own (`.npz`), AMASS (`.npz`) or BVH.
 
-    A motion of the model's parts and rest pose is taken as it is. One of the same skeleton, or of a model of the same family, is
-    copied. A motion of another skeleton is retargeted: segments keep their directions, see `model.motion.retarget`.
+    A motion of the model's parts and rest pose is taken as it is. One of the same skeleton, or of a model of the same
+    family, is copied. A motion of another skeleton is retargeted: segments keep their directions, see
+    `model.motion.retarget`.
 
     Parameters
     ----------

@@ -33,6 +33,7 @@ from scanprep.ranges import Positive
 from scanprep.registration.unit import resolve_unit
 from scanprep.surfaces.cloud import read_sound_surface
 
+from ..body import Progress, share_progress
 from ..cli import read_body
 from ..export.names import Names
 from ..files import load_model
@@ -93,8 +94,7 @@ def fit(scan: ScanArg, output: Output, features: Path | None = None, control: Pa
         workers: Who fits the scans of a folder.
     """
     if names and not own_mesh:
-        raise UsageError("--names: expected --own-mesh with it; statue.glb has our names, and scape statue animate "
-                         "gives it others")
+        raise UsageError("--names: expected --own-mesh with it; scape statue animate gives statue.glb other names")
     work = Work(humanoid() if control is None else read_control(control), config, unit, cut, own_mesh, names, output)
     if not scan.is_dir():
         if features is None and control is not None:
@@ -133,6 +133,7 @@ class Work:
     def __call__(self, inputs: ScanTask, context: TaskContext) -> list[Metric]:
         """Fit the statue of some files into the folder of a room; the figures."""
         start = time.perf_counter()
+        context.report_progress(0, 100)
         unit = resolve_unit(inputs.scan, self.unit)
         person = self.control.skeleton.names == humanoid().skeleton.names
         scan, texture, rows, doubts, metres = read_scan(inputs, unit, person, self.cut)
@@ -145,7 +146,8 @@ class Work:
                 raise ValueError(f"{inputs.landmarks}: expected at least three joints or points, got "
                                  f"{len(joints) + len(points)}; click more: {_pick(inputs.scan)}")
         try:
-            statue = fit_statue(scan, joints, points, self.control, self.config, context.report_progress, context.step)
+            statue = fit_statue(scan, joints, points, self.control, self.config,
+                                share_progress(context.report_progress, 5, 80), context.step)
         except UnplacedError as error:
             # a result that failed leaves no file: what was found lies with the records of the output
             found = {name: place / scale for name, place in {**error.features.joints, **error.features.points}.items()}
@@ -160,7 +162,8 @@ class Work:
             image = context.step("texture", (self, inputs), lambda: bake_texture(
                 statue.control, statue.map, scan_look(texture or scan)))
             statue = replace(statue, texture=image)
-        metrics = write_statue(context.folder, inputs.scan.name, scan, statue, rows, doubts)
+        metrics = write_statue(context.folder, inputs.scan.name, scan, statue, rows, doubts,
+                               share_progress(context.report_progress, 80, 100))
         write_landmarks(context.folder / FEATURES, {name: place / scale for name, place in features_of(statue).items()},
                         unit)
         if self.own_mesh:
@@ -186,16 +189,19 @@ def features_of(statue: FittedStatue) -> dict[str, np.ndarray]:
 
 
 def write_statue(folder: Path, name: str, scan: Mesh, statue: FittedStatue, rows: list[Metric],
-                 doubts: Sequence[str] = ()) -> list[Metric]:
+                 doubts: Sequence[str] = (), progress: Progress | None = None) -> list[Metric]:
     """Write a statue with its files for other programs and its page; the figures."""
     posed, surface, control = statue.posed, statue.surface, statue.control
     assert posed is not None and surface is not None, "made by fit_statue"
     save_statue(folder, statue)
+    report_progress = progress or (lambda done, total: None)
     levels, fine = measure_levels(statue, scan)
+    report_progress(1, 3)
     adaptive = adaptive_level(statue, scan)
     write_mesh(folder / "reconstruction.ply", levels[-1].mesh)
     write_body(folder, statue)
     write_for_programs(folder, statue, levels[-1].mesh.vertices, fine, statue.upright_axis)
+    report_progress(2, 3)
     # 1. how well the control model was registered to the scan
     rows = [judgement_row(judge_statue(statue, scan, levels[-1], doubts)), *rows,
             *([Metric("not seen in the scan", ", ".join(posed.missing))] if posed.missing else []),
@@ -227,6 +233,7 @@ def write_statue(folder: Path, name: str, scan: Mesh, statue: FittedStatue, rows
     save_png(folder / "picture.png", picture)
     statue_page(name, scan, statue, levels, rows, adaptive, in_motion(statue),
                 picture).write(folder / "report.html")
+    report_progress(3, 3)
     return rows
 
 
@@ -302,8 +309,8 @@ def animate(statue: StatueArg, motion: MotionArg, output: Output, model: Path | 
     """A statue in motion: its skeleton moves the control mesh, the detail stands on the moving normals.
 
     The motion is BVH, motion.npz of any of our commands, AMASS, or a table of key poses (keys.csv). Parts are matched
-    by their names, and rest poses may differ. With --model the control mesh follows a learned model instead of plain skinning, with all that the model
-    knows of how skin moves; the motion is then one of that model.
+    by their names, and rest poses may differ. With --model the control mesh follows a learned model instead of plain
+    skinning, with all that the model knows of how skin moves; the motion is then one of that model.
 
     Example: scape statue animate statue walk.bvh -o walking
 

@@ -13,7 +13,7 @@ from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.sanitise import sanitise
 from scanprep.ranges import Settings
 
-from ..body import Progress
+from ..body import Progress, share_progress
 from .control.files import humanoid
 from .control.model import ControlModel, Statue
 from .detail.displacement import DisplacementConfig, bake_displacement, unfold_control
@@ -138,17 +138,18 @@ def fit_statue(scan: Mesh, joints: Mapping[str, np.ndarray] | None = None,
     inputs = (scan, joints, points, control)
     # 1. pose the control model by features, which are found if none are given
     if joints is None and points is None:
-        features = step("features", inputs, lambda: find_features(control, scan))
+        features = step("features", inputs, lambda: find_features(control, scan, share_progress(progress, 0, 40)))
         posed = pose_automatically(control, features, config.start == "registered")                # [Statues] Eq. 4-5
     else:
         posed = pose_by_features(control, joints or {}, points or {})                           # [Statues] Eq. 1-5
     # 2. fit the control mesh to the scan, open its folds, and measure what is left as a displacement map
     surface = step("surface", (inputs, config), lambda: fit_surface(
-        control.mesh, posed.start, scan, config.surface, progress, posed.hidden))                # [Statues] Eq. 6-18
+        control.mesh, posed.start, scan, config.surface, share_progress(progress, 40, 80),
+        posed.hidden))                                                                           # [Statues] Eq. 6-18
     fitted = step("control", (inputs, config), lambda: fit_control(
         control, posed.features, surface, scan, config.displacement))
     map = step("map", (inputs, config), lambda: bake_displacement(
-        fitted, scan, config.displacement, progress))                                            # [Statues] Eq. 19-21
+        fitted, scan, config.displacement, share_progress(progress, 80, 100)))  # [Statues] Eq. 19-21
     return FittedStatue(fitted, posed.features.pose, map, posed=posed, surface=surface)
 
 

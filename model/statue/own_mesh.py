@@ -127,33 +127,42 @@ def write_own_mesh(path: Path, source: Path, metres: float, statue: Statue, name
     faces = np.concatenate([piece.triangles + start for piece, start in zip(pieces, starts, strict=False)])
     points = np.concatenate([piece.points for piece in pieces])
     weights, loose = carry_weights(statue, Mesh(points @ turn_up(up), faces))
-    # 3. meshes with new attributes; the rest of the file stays
+    # 3. meshes with new attributes on our joints; the rest of the file stays
     arrays, rig = glb.Glb(tree, binary), own_rig(statue, names).with_up(up)
-    nodes, meshes, number = build_nodes(rig)[1:], list[dict[str, Any]](), 0
-    for node, own in shapes:
+    joints, (meshes, shown) = build_nodes(rig)[1:], add_meshes(arrays, tree, binary, shapes, weights)
+    J = len(joints)
+    document: dict[str, Any] = {
+        # the joints are nodes 1 to J, as `add_skin` numbers them, so the first mesh stands before them
+        "scene": 0, "scenes": [{"nodes": [0, 1, *range(J + 1, J + len(shown))]}],
+        "nodes": [shown[0], *joints, *shown[1:]], "meshes": meshes, "skins": [add_skin(arrays, rig)],
+        "images": [embed_image(arrays, source, image) for image in tree.get("images", [])],
+        **{key: [name for name in tree.get(key, []) if name not in DROPPED]
+           for key in ("extensionsUsed", "extensionsRequired")},
+        **{key: tree[key] for key in ("asset", "materials", "textures", "samplers", "extensions", "extras")
+           if key in tree}}
+    write_file(path, arrays.pack({key: value for key, value in document.items() if value not in ([], {})}, up))
+    targets = sum(len(piece.primitive.get("targets", [])) for piece in pieces)
+    return [Metric("own mesh, vertices", len(points)), Metric("own mesh, loose parts that stay stiff", loose),
+            *([Metric("own mesh, morph targets kept", targets)] if targets else [])]
+
+
+def add_meshes(arrays: glb.Glb, tree: dict[str, Any], binary: bytes, shapes: list[tuple[dict[str, Any], list[Piece]]],
+               weights: np.ndarray) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
+    """Add the meshes of a file with the weights (n, J) of all their vertices; their entries, and nodes that show them.
+    """
+    meshes, nodes, start = list[dict[str, Any]](), list[dict[str, Any]](), 0
+    for node, pieces in shapes:
         primitives = []
-        for piece in own:
-            primitives.append(rewrite(arrays, tree, binary, piece, weights[starts[number]:starts[number + 1]]))
-            number += 1
+        for piece in pieces:
+            end = start + len(piece.points)
+            primitives.append(rewrite(arrays, tree, binary, piece, weights[start:end]))
+            start = end
+        nodes.append({**{key: node[key] for key in ("name", "weights", "extras") if key in node},
+                      "mesh": len(meshes), "skin": 0})
         mesh = tree["meshes"][node["mesh"]]
         meshes.append({**{key: mesh[key] for key in ("name", "weights", "extras") if key in mesh},
                        "primitives": primitives})
-        nodes.append({**{key: node[key] for key in ("name", "weights", "extras") if key in node},
-                      "mesh": len(meshes) - 1, "skin": 0})
-    # the joints are nodes 1 to J, as `add_skin` numbers them, so the first mesh stands before them
-    J = len(rig.skeleton.parents)
-    nodes = [nodes[J], *nodes[:J], *nodes[J + 1:]]
-    kept = {key: value for key, value in tree.items() if key in (
-        "asset", "materials", "textures", "samplers", "extensions", "extras")}
-    images = [embed_image(arrays, source, image) for image in tree.get("images", [])]
-    needed = {key: [name for name in tree[key] if name not in DROPPED]
-              for key in ("extensionsUsed", "extensionsRequired") if key in tree}
-    document = {**kept, "scene": 0, "scenes": [{"nodes": [0, 1, *range(J + 1, len(nodes))]}], "nodes": nodes,
-                "meshes": meshes, "skins": [add_skin(arrays, rig)], "images": images, **needed}
-    write_file(path, arrays.pack({key: value for key, value in document.items() if value not in ([], {})}, up))
-    return [Metric("own mesh, vertices", len(points)), Metric("own mesh, loose parts that stay stiff", loose),
-            *([Metric("own mesh, morph targets kept", sum(len(p.primitive.get("targets", [])) for p in pieces))]
-              if any("targets" in piece.primitive for piece in pieces) else [])]
+    return meshes, nodes
 
 
 def animate_own_mesh(path: Path, stored: Path, statue: Statue, motion: Retargeted, names: Names | None = None) -> None:

@@ -124,7 +124,7 @@ def decode_text(data: bytes) -> str:
     return data.decode("latin-1")
 
 
-def table_numbers(path: Path, rows: Sequence[tuple[int, list[str]]], width: int, separator: str, fill: bool = False,
+def table_numbers(path: Path, rows: Sequence[tuple[int, Sequence[str]]], width: int, separator: str, fill: bool = False,
                   error: type[StorageError] = StorageError) -> np.ndarray:
     """Read numbers (T, width) from the lines of `table_rows`, NaN for an empty cell.
 

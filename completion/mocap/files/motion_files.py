@@ -121,8 +121,8 @@ def write_residuals(path: Path, motion: Motion) -> None:
 def write_motion_bvh(path: Path, motion: Motion, subject: Subject) -> None:
     """Write a BVH in centimetres: the bones of the subject at rest, and the motion."""
     rest = subject.vertices(np.zeros((len(subject.skeleton.parents), 3)))
-    write_bvh(path, subject.rest_skeleton, motion.poses, motion.trans, motion.rate, up=guess_upright(subject.template)[0],
-              body=subject.template.with_vertices(rest))
+    write_bvh(path, subject.rest_skeleton, motion.poses, motion.trans, motion.rate,
+              up=guess_upright(subject.template)[0], body=subject.template.with_vertices(rest))
 
 
 def write_glb(path: Path, motion: Motion, subject: Subject, bodies: Callable[[np.ndarray], np.ndarray] | None = None,

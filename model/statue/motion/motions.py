@@ -62,7 +62,7 @@ def read_statue_motion(statue: Statue, path: Path, rate: float | None = None) ->
     count, own, people = stored.poses.shape[1], len(parts.parents), 16
     again = "make the file again (scape animate, scape demo), or bring BVH; for a learned model name it with --model"
     if stored.made_for == "scape" or count not in (own, people):
-        raise StorageError(f"{path}: it does not say which skeleton its {count} parts are of, and the statue has {own}; "
+        raise StorageError(f"{path}: it does not say which skeleton its {count} parts are of, the statue has {own}; "
                            f"{again}")
     doubt = f"{path.name} does not say which skeleton it is of, and was taken for {{}} by its {count} parts; {again}"
     if count == own:

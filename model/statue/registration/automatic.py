@@ -16,6 +16,7 @@ from scanprep.registration.schedule import RegistrationConfig
 from scanprep.threads import one_thread, search_threads
 from scanprep.words import number_of
 
+from ...body import Progress
 from ..control.model import ControlModel
 from ..detail.subdivision import divide_long_edges
 from .features import FeatureFit, fit_features
@@ -45,7 +46,7 @@ class Features:
 
 
 @one_thread()
-def find_features(control: ControlModel, scan: Mesh) -> Features:
+def find_features(control: ControlModel, scan: Mesh, progress: Progress | None = None) -> Features:
     """Find joint centres and landmarks of a person who stands upright, by a humanoid control model.
 
     Unit and axes of the scan need not be known. It may have holes, or show a part of a person. The control model, z up
@@ -63,7 +64,7 @@ def find_features(control: ControlModel, scan: Mesh) -> Features:
     if problem:
         return Features({}, {}, (*control.skeleton.names, *control.landmarks), None, None, problem)
     result = register(best.mesh, data, config=RegistrationConfig(graph=RegistrationConfig().graph[-2:]),
-                      start=np.eye(4))
+                      start=np.eye(4), progress=progress)
     joints, points, missing = _features(control, result, data, metres)
     fit = fit_features(control, joints, points) if len(joints) + len(points) > 2 else None
     registered = control.mesh.with_vertices(result.mesh.vertices / metres)
