@@ -59,8 +59,10 @@ def judge_statue(statue: FittedStatue, scan: Mesh, finest: Level, left_out: Sequ
     if misfit > 0.03:
         check.append(f"features lie {100 * misfit:.1f}% of the height from those of the posed control model: left and "
                      "right exchanged, one in a wrong place, or clothes?")
-    empty = {*parts_without_data(statue), *find_unseen(statue)}
-    lacking = [in_words(name) for name in control.skeleton.names if name in empty]
+    # a joint that was not found at first is no doubt where the finished surface has data around it
+    empty, measured = parts_without_data(statue), part_shares(statue)[MEASURED]
+    lacking = [in_words(name) for name, share in zip(control.skeleton.names, measured, strict=True)
+               if name in empty or (name in posed.missing and share < 0.5)]
     check += [f"the scan has no data on {', '.join(lacking[:NAMED])}"] if lacking else []
     check += [posed.problem] if posed.problem else []
     return Judgement.of(failed, check)
@@ -79,14 +81,6 @@ def share_missed(scan: Mesh, surface: Mesh, far: float) -> float:
         return 0.0
     within = np.asarray(igl.fast_winding_number(surface.vertices, surface.faces, off)).ravel() > 0.5
     return float((~within).sum() / len(points))
-
-
-def find_unseen(statue: FittedStatue) -> list[str]:
-    """List joints that were not found on the scan, and around which the finished surface has no data either."""
-    assert statue.posed is not None, "made by fit_statue"
-    measured = part_shares(statue)[MEASURED]
-    return [name for name, share in zip(statue.control.skeleton.names, measured, strict=True)
-            if name in statue.posed.missing and share < 0.5]
 
 
 def part_shares(statue: FittedStatue, towards: np.ndarray | None = None) -> dict[int, np.ndarray]:
@@ -138,7 +132,8 @@ def rig_doubts(statue: FittedStatue, surface: Mesh) -> list[str]:
     # another's place 0.31 to 0.75, feet in a plinth 0.74
     limbs = [j for j, name in enumerate(names) if name[1] == "_" and name[2:] not in ("sternoclavicular", "wrist")]
     bad = [in_words(names[j]) for j in limbs if shares[MEASURED][j] < 0.76 and shares[HOLE][j] < 0.5]
-    inner = part_shares(statue, inward(control))
+    # the inner sides of left parts face right, those of right parts left
+    inner = part_shares(statue, np.array([{"l_": -1, "r_": 1}.get(name[:2], 0) * left for name in names]))
     joined = [j for j in limbs if names[j][2:] in ("hip", "knee") and inner[MEASURED][j] < 0.5]
     if len(joined) > 1 and shares[MEASURED][joined].min() > 0.4:
         doubts.append("clothes join the legs, which move as one: the joints of the legs are a guess")
@@ -153,9 +148,3 @@ def side_and_front(control: ControlModel) -> tuple[np.ndarray, np.ndarray]:
     left = at["l_hip"] - at["r_hip"]
     front = np.cross(left, at["skullbase"] - 0.5 * (at["l_hip"] + at["r_hip"]))
     return left / np.linalg.norm(left), front / np.linalg.norm(front)
-
-
-def inward(control: ControlModel) -> np.ndarray:
-    """Compute unit vectors (J, 3) from each left part to the right and back; zero for the others."""
-    names, left = control.skeleton.names, side_and_front(control)[0]
-    return np.array([{"l": -1, "r": 1}.get(name[0] if name[1] == "_" else "", 0) * left for name in names])
