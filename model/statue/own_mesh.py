@@ -36,7 +36,7 @@ SAMPLES = 50_000     # points over the whole surface that tell how far its parts
 DROPPED = ("KHR_draco_mesh_compression", "EXT_mesh_gpu_instancing")      # extensions whose arrays are written out plain
 
 
-class Piece(NamedTuple):
+class PlacedPrimitive(NamedTuple):
     """A primitive of a glTF file where it stands in the scene."""
 
     primitive: dict[str, Any]
@@ -146,7 +146,7 @@ def write_own_mesh(path: Path, source: Path, metres: float, statue: Statue, name
             *([Metric("own mesh, morph targets kept", targets)] if targets else [])]
 
 
-def add_meshes(arrays: glb.Glb, tree: dict[str, Any], binary: bytes, shapes: list[tuple[dict[str, Any], list[Piece]]],
+def add_meshes(arrays: glb.Glb, tree: dict[str, Any], binary: bytes, shapes: list[tuple[dict[str, Any], list[PlacedPrimitive]]],
                weights: np.ndarray) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
     """Add the meshes of a file with the weights (n, J) of all their vertices; their entries, and nodes that show them.
     """
@@ -204,7 +204,7 @@ def read_as_gltf(path: Path) -> tuple[dict[str, Any], bytes]:
 
 
 def place_pieces(path: Path, tree: dict[str, Any], binary: bytes, frame: np.ndarray
-                 ) -> list[tuple[dict[str, Any], list[Piece]]]:
+                 ) -> list[tuple[dict[str, Any], list[PlacedPrimitive]]]:
     """List the nodes with a mesh, and their primitives of triangles as they stand in the scene, turned by a frame."""
     nodes = [(number, node, frame @ matrix) for number, node, matrix in glb.nodes_of(tree)]
     places, out = {number: matrix for number, _, matrix in nodes}, []
@@ -222,12 +222,12 @@ def place_pieces(path: Path, tree: dict[str, Any], binary: bytes, frame: np.ndar
                 motion = instance[None]
                 if joints is not None and "JOINTS_0" in decoded["attributes"]:
                     motion = np.einsum("nj,jab->nab", glb.weights_of(own, data, decoded, len(joints)), joints)
-                pieces.append(Piece({**primitive, **decoded}, own, data, motion))
+                pieces.append(PlacedPrimitive({**primitive, **decoded}, own, data, motion))
         out += [(node, pieces)] if pieces else []
     return out
 
 
-def rewrite(arrays: glb.Glb, tree: dict[str, Any], binary: bytes, piece: Piece, weights: np.ndarray) -> dict[str, Any]:
+def rewrite(arrays: glb.Glb, tree: dict[str, Any], binary: bytes, piece: PlacedPrimitive, weights: np.ndarray) -> dict[str, Any]:
     """Add a piece's surface as it stands, with blend weights (n, J); all else of its primitive stays."""
     primitive, points = piece.primitive, piece.points
     kept = {name: number for name, number in primitive["attributes"].items() if not name.startswith((
