@@ -14,6 +14,7 @@ from readme_user import of_a_user
 
 from completion import Motion
 from completion.__main__ import main
+from completion.demo.sample import PEOPLE, RATE, WALKER, write_figure
 from model import load_model, write_body_npz
 from scanprep import RegisteredSet, write_mesh
 from scanprep.batch.ownership import HOME
@@ -21,6 +22,7 @@ from scanprep.batch.values import load_step_header
 from scanprep.decimation.registered_set import decimate_set
 from scanprep.pipeline.prepare import SCANS
 from scanprep.synthetic.data_set import read_views
+from scanprep.synthetic.people import SyntheticPerson, synthesise_walk
 from scanprep.viewer import server
 
 ROOT = Path(__file__).parents[1]
@@ -135,6 +137,7 @@ def user_folder(demo, folder):
                            ("markers/layout.json", "layout.json")):
         shutil.copy(demo / source, folder / target)
     shutil.copy(demo / "scans" / f"{mine[0].split(',')[0]}.ply", folder / "standing.ply")
+    write_figure(folder, SyntheticPerson(PEOPLE[WALKER]), *synthesise_walk(24, RATE))
     shutil.copy(demo / "scans" / f"{mine[1].split(',')[0]}.ply", folder / "anna.ply")
     cameras = {}
     for k, view in enumerate(read_views(demo / "template_scan" / "views" / "rest.npz")):

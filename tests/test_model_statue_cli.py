@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from glb_motion import SkinnedFile
 from PIL import Image
 from trimesh.remesh import subdivide_to_size
 
@@ -21,6 +22,7 @@ from model.statue.registration.automatic import Features
 from model.statue.registration.features import FeatureFit
 from model.statue.verdict import judge_statue
 from scanprep import Mesh, read_mesh, write_mesh
+from scanprep.geometry.format_glb import turn_up
 from scanprep.geometry.landmark_names import FACE
 from scanprep.geometry.landmarks import read_landmarks
 from scanprep.pipeline.scans import ScanTask
@@ -60,7 +62,7 @@ def made(tmp_path_factory, person):
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(report, "HEIGHT", 100)                             # of its pictures, which take half the time
         assert run("fit", folder / "scan.ply", "-o", folder / "statue", "--features", folder / "features.json",
-                   "--unit", "mm", "--size", 512) == 0
+                   "--unit", "mm", "--size", 512, "--own-mesh", "--names", "unity") == 0
     return folder
 
 
@@ -81,6 +83,14 @@ def test_the_surface_comes_back_and_the_missing_arm_is_a_hole(made, person):
     assert statue.texture is not None and {HOLE, MEASURED} <= set(np.unique(statue.map.coverage).tolist())
     for name in ("report.html", "statue.glb", "statue.x3d", "displacement.png", "reconstruction.ply"):
         assert (made / "statue" / name).stat().st_size > 1000
+
+
+def test_the_mesh_of_the_file_hangs_on_the_skeleton_in_metres(made):
+    own, statue = SkinnedFile(made / "statue" / "own.glb"), load_statue(made / "statue")
+    scan = read_mesh(made / "scan.ply", "mm").vertices @ turn_up(statue.upright_axis).T
+    np.testing.assert_allclose(np.concatenate(own.vertices()), scan, atol=1e-5)
+    assert own.bones[:3] == ["Hips", "Spine", "Head"]
+    assert run("fit", made / "scan.ply", "-o", made / "other", "--names", "unity") == 2
 
 
 @pytest.mark.parametrize("wrong, verdict, why", [
@@ -207,7 +217,7 @@ def test_bad_input_is_refused_by_name(made, tmp_path, capsys):
             (("fit", cloud), "at least 100 points at different places, got 50"),
             (("fit", scan, "--features", strange), "left antenna"),
             (("fit", tmp_path / "empty"), "found none"), (("reconstruct", tmp_path / "empty"), "statue.json"),
-            (("animate", made / "statue", tmp_path / "motion.npz"), "17 parts"),
+            (("animate", made / "statue", tmp_path / "motion.npz"), "the statue has 17"),
             (("animate", made / "statue", tmp_path / "none.bvh"), "none.bvh")):
         assert run(*words, "-o", tmp_path / "out.ply" if words[0] == "reconstruct" else tmp_path / "out") == 1
         told = " ".join(capsys.readouterr().err.split())
@@ -232,7 +242,7 @@ def test_a_scan_in_millimetres_on_a_floor_becomes_a_body_in_metres(person, tmp_p
 def test_what_is_done_is_not_done_again(made, capsys):
     before = (made / "statue" / "statue.glb").stat().st_mtime_ns
     assert run("fit", made / "scan.ply", "-o", made / "statue", "--features", made / "features.json", "--unit", "mm",
-               "--size", 512) == 0
+               "--size", 512, "--own-mesh", "--names", "unity") == 0
     assert (made / "statue" / "statue.glb").stat().st_mtime_ns == before
 
 

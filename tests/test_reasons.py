@@ -44,6 +44,7 @@ SAID_BY = {
     "model/coregistration/lead.py model_lead": "prep register, prep run",
     "model/statue/verdict.py judge_statue": "statue fit",
     "model/statue/motion/motions.py read_statue_motion": "statue animate",
+    "model/statue/own_mesh.py write_own_mesh": "statue fit",
     "model/statue/motion/motions.py follower_of": "statue animate",
     "scanprep/alignment/views.py views_problem": "prep views",
     "scanprep/judgement.py ": f"{ON_SCANS}, {ON_MARKERS}",

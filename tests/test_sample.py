@@ -24,7 +24,8 @@ def points_of(path, one):
 
 
 def test_the_files_are_those_that_the_documents_name_and_none_is_a_landmark(sample_folder):
-    assert set(files(sample_folder)) == {"half_view.ply", "walk.c3d", "unnamed.c3d", "scans/scans.csv",
+    assert set(files(sample_folder)) == {"half_view.ply", "walk.c3d", "unnamed.c3d", "scans/scans.csv", "figure.glb",
+                                         "walk.bvh",
                                          *(f"scans/{one.file}" for one in SCANS)}
 
 

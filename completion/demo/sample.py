@@ -10,14 +10,17 @@ from shlex import quote
 
 import numpy as np
 
+from model.export.bvh import write_bvh
 from scanprep.console import Metric, Outcome, Progress, bar
 from scanprep.geometry import tables
 from scanprep.geometry.files import PointCloud, name_of, write_mesh, write_points
 from scanprep.geometry.mesh import Mesh
 from scanprep.judgement import Judgement
 from scanprep.pipeline.scans import TABLE
+from scanprep.skeleton.roles import part_kind
 from scanprep.synthetic.data_set import near_rest, stand
 from scanprep.synthetic.people import (
+    LANDMARKS,
     MARKERS,
     NAMED_POSES,
     BodyShape,
@@ -66,11 +69,14 @@ SCANS = (SampleScan("anna.ply", "anna", "standing", CAREFUL), SampleScan("anna_b
          SampleScan("carol.stl", "carol", "standing", COARSE, 1000), SampleScan("dora.ply.gz", "dora", "stooped"),
          SampleScan("emil.xyz", "emil", "standing", COARSE))
 HALF_VIEW = SampleScan("half_view.ply", "frank", "wave_right", ONE_CAMERA)
+# colours painted on the figure, by kind of part; what is left is skin
+CLOTHES = {"pelvis": (0.25, 0.24, 0.28), "thigh": (0.25, 0.24, 0.28), "shin": (0.25, 0.24, 0.28),
+           "abdomen": (0.20, 0.35, 0.60), "chest": (0.20, 0.35, 0.60), "upper_arm": (0.20, 0.35, 0.60)}
 WALKER, FRAMES, RATE = "frank", 96, 60.0                                # a gait cycle takes 1.1 seconds
 
 
 def write_sample(out: Out = Path("sample")) -> Outcome:
-    """Files to try every command with: raw scans of women and men, a half view, a walk and a table.
+    """Files to try every command with: raw scans of women and men, a half view, a walk, a figure and a table.
 
     They are made up from the built-in people, always the same. Nobody clicked a landmark.
 
@@ -91,12 +97,29 @@ def write_sample(out: Out = Path("sample")) -> Outcome:
     with bar("recording a walk") as progress:
         walk = record_markers(bodies, people[WALKER].mesh.faces, RATE, np.random.default_rng(len(SCANS) + 1), progress)
     write_markers(out / "walk.c3d", walk)
+    write_figure(out, people[WALKER], poses, trans)
     write_markers(out / "unnamed.c3d", replace(walk, labels=tuple(f"*{i}" for i in range(len(walk.labels)))))
     sexes = [PEOPLE[name].sex for name in {one.person for one in SCANS}]
     return Outcome(out, [Metric("scans", len(SCANS)), Metric("women on them", sexes.count("female")),
                          Metric("men on them", sexes.count("male")), Metric("frames of the walk", len(poses)),
                          Metric("markers on the walker", len(walk.labels))],
                    judgement=Judgement.of(), following=f"cd {quote(str(out))}, then scape mosh walk.c3d -o out")
+
+
+def write_figure(out: Path, person: SyntheticPerson, poses: np.ndarray, trans: np.ndarray) -> None:
+    """Write a figure as modelling programs do, figure.glb with painted clothes and eyes of their own, and walk.bvh."""
+    import trimesh
+
+    paint = np.array([CLOTHES.get(part_kind(name), (0.85, 0.66, 0.55)) for name in person.skeleton.names])
+    mesh = person.mesh
+    vertices, faces, colors = mesh.vertices, mesh.faces, paint[person.skeleton.part_of_vertex(mesh)]
+    for name in ("left eye", "right eye"):
+        eye = trimesh.creation.icosphere(2, 0.012)
+        faces = np.vstack([faces, eye.faces + len(vertices)])
+        vertices = np.vstack([vertices, eye.vertices + mesh.vertices[LANDMARKS[name]]])
+        colors = np.vstack([colors, np.full(eye.vertices.shape, 0.95)])
+    write_mesh(out / "figure.glb", Mesh(vertices, faces, colors), "single")
+    write_bvh(out / "walk.bvh", person.skeleton, poses, trans, RATE, body=person.mesh)
 
 
 def scan_to_file(folder: Path, one: SampleScan, person: SyntheticPerson, seed: int) -> None:

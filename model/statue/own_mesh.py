@@ -1,7 +1,6 @@
 """The file's own mesh on the skeleton of its statue: vertices, shells and materials as they came, with weights."""
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -36,7 +35,7 @@ SAMPLES = 50_000     # points over the whole surface that tell how far its parts
 DROPPED = ("KHR_draco_mesh_compression", "EXT_mesh_gpu_instancing")      # extensions whose arrays are written out plain
 
 
-class Piece(NamedTuple):
+class PlacedPrimitive(NamedTuple):
     """A primitive of a glTF file where it stands in the scene."""
 
     primitive: dict[str, Any]
@@ -44,25 +43,23 @@ class Piece(NamedTuple):
     binary: bytes
     motion: np.ndarray             # (n, 4, 4) or (1, 4, 4), from its numbers to the scene, metres
 
-    def attribute(self, name: str) -> np.ndarray:
-        """Read an attribute (n, width)."""
-        return glb.accessor(self.tree, self.binary, self.primitive["attributes"][name], "VEC3", "VEC4").astype(float)
+    def bend(self, vectors: np.ndarray, matrices: np.ndarray | None = None) -> np.ndarray:
+        """Carry directions (n, 3) along, without the translation, or by other matrices (n, 3, 3)."""
+        matrices = self.motion[:, :3, :3] if matrices is None else matrices
+        return np.einsum("nab,nb->na", np.broadcast_to(matrices, (len(vectors), 3, 3)), vectors)
 
-    def bend(self, vectors: np.ndarray) -> np.ndarray:
-        """Carry directions (n, 3) along, without the translation."""
-        return np.einsum("nab,nb->na", np.broadcast_to(self.motion[:, :3, :3], (len(vectors), 3, 3)), vectors)
-
-    @property
-    def points(self) -> np.ndarray:
-        """(n, 3) metres, in the scene."""
-        return self.bend(self.attribute("POSITION")) + self.motion[:, :3, 3]
-
-    @property
-    def normals(self) -> np.ndarray:
-        """(n, 3) unit, in the scene: turned by the cofactors, which have no division where a scale is zero."""
-        x, y, z = np.moveaxis(self.motion[:, :3, :3], 1, 0)
-        cofactors = np.stack([np.cross(y, z), np.cross(z, x), np.cross(x, y)], axis=1)
-        return unit(self._replace(motion=(-1.0) ** self.mirrored * cofactors).bend(self.attribute("NORMAL")))
+    def read(self, name: str) -> np.ndarray:
+        """Read an attribute (n, width); positions in metres, normals and tangents as they are in the scene."""
+        values = glb.accessor(self.tree, self.binary, self.primitive["attributes"][name],
+                              "SCALAR", "VEC2", "VEC3", "VEC4").astype(float)
+        side = -1.0 if self.mirrored else 1.0
+        if name == "POSITION":
+            return self.bend(values) + self.motion[:, :3, 3]
+        if name == "NORMAL":                      # by the cofactors, which have no division where a scale is zero
+            x, y, z = np.moveaxis(self.motion[:, :3, :3], 1, 0)
+            cofactors = np.stack([np.cross(y, z), np.cross(z, x), np.cross(x, y)], axis=1)
+            return unit(self.bend(values, side * cofactors))
+        return np.column_stack([unit(self.bend(values[:, :3])), side * values[:, 3]]) if name == "TANGENT" else values
 
     @property
     def mirrored(self) -> bool:
@@ -72,8 +69,11 @@ class Piece(NamedTuple):
     @property
     def triangles(self) -> np.ndarray:
         """(F, 3), outward in the scene."""
-        faces = glb.primitive_triangles(self.tree, self.binary, self.primitive, len(self.attribute("POSITION")))
+        faces = glb.primitive_triangles(self.tree, self.binary, self.primitive, len(self.read("POSITION")))
         return faces[:, ::-1] if self.mirrored else faces
+
+
+Shapes = list[tuple[dict[str, Any], list[PlacedPrimitive]]]      # nodes with a mesh, and its primitives
 
 
 def unit(vectors: np.ndarray) -> np.ndarray:
@@ -123,9 +123,9 @@ def write_own_mesh(path: Path, source: Path, metres: float, statue: Statue, name
     if not pieces:
         raise ValueError(f"{source}: expected triangles for --own-mesh, found points only; leave it out")
     # 2. weights of all vertices, of which those at one place have the same
-    starts = np.cumsum([0, *(len(piece.points) for piece in pieces)])
+    starts = np.cumsum([0, *(len(piece.read("POSITION")) for piece in pieces)])
     faces = np.concatenate([piece.triangles + start for piece, start in zip(pieces, starts, strict=False)])
-    points = np.concatenate([piece.points for piece in pieces])
+    points = np.concatenate([piece.read("POSITION") for piece in pieces])
     weights, loose = carry_weights(statue, Mesh(points @ turn_up(up), faces))
     # 3. meshes with new attributes on our joints; the rest of the file stays
     arrays, rig = glb.Glb(tree, binary), own_rig(statue, names).with_up(up)
@@ -138,15 +138,16 @@ def write_own_mesh(path: Path, source: Path, metres: float, statue: Statue, name
         "images": [embed_image(arrays, source, image) for image in tree.get("images", [])],
         **{key: [name for name in tree.get(key, []) if name not in DROPPED]
            for key in ("extensionsUsed", "extensionsRequired")},
-        **{key: tree[key] for key in ("asset", "materials", "textures", "samplers", "extensions", "extras")
-           if key in tree}}
+        **{key: tree[key] for key in ("asset", "materials", "textures", "samplers", "extras") if key in tree},
+        # others, as that of VRM, refer to nodes that are replaced
+        "extensions": {key: value for key, value in tree.get("extensions", {}).items() if key.startswith("KHR_")}}
     write_file(path, arrays.pack({key: value for key, value in document.items() if value not in ([], {})}, up))
     targets = sum(len(piece.primitive.get("targets", [])) for piece in pieces)
     return [Metric("own mesh, vertices", len(points)), Metric("own mesh, loose parts that stay stiff", loose),
             *([Metric("own mesh, morph targets kept", targets)] if targets else [])]
 
 
-def add_meshes(arrays: glb.Glb, tree: dict[str, Any], binary: bytes, shapes: list[tuple[dict[str, Any], list[Piece]]],
+def add_meshes(arrays: glb.Glb, tree: dict[str, Any], binary: bytes, shapes: Shapes,
                weights: np.ndarray) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
     """Add the meshes of a file with the weights (n, J) of all their vertices; their entries, and nodes that show them.
     """
@@ -154,7 +155,7 @@ def add_meshes(arrays: glb.Glb, tree: dict[str, Any], binary: bytes, shapes: lis
     for node, pieces in shapes:
         primitives = []
         for piece in pieces:
-            end = start + len(piece.points)
+            end = start + len(piece.read("POSITION"))
             primitives.append(rewrite(arrays, tree, binary, piece, weights[start:end]))
             start = end
         nodes.append({**{key: node[key] for key in ("name", "weights", "extras") if key in node},
@@ -204,7 +205,7 @@ def read_as_gltf(path: Path) -> tuple[dict[str, Any], bytes]:
 
 
 def place_pieces(path: Path, tree: dict[str, Any], binary: bytes, frame: np.ndarray
-                 ) -> list[tuple[dict[str, Any], list[Piece]]]:
+                 ) -> Shapes:
     """List the nodes with a mesh, and their primitives of triangles as they stand in the scene, turned by a frame."""
     nodes = [(number, node, frame @ matrix) for number, node, matrix in glb.nodes_of(tree)]
     places, out = {number: matrix for number, _, matrix in nodes}, []
@@ -222,30 +223,21 @@ def place_pieces(path: Path, tree: dict[str, Any], binary: bytes, frame: np.ndar
                 motion = instance[None]
                 if joints is not None and "JOINTS_0" in decoded["attributes"]:
                     motion = np.einsum("nj,jab->nab", glb.weights_of(own, data, decoded, len(joints)), joints)
-                pieces.append(Piece({**primitive, **decoded}, own, data, motion))
+                pieces.append(PlacedPrimitive({**primitive, **decoded}, own, data, motion))
         out += [(node, pieces)] if pieces else []
     return out
 
 
-def rewrite(arrays: glb.Glb, tree: dict[str, Any], binary: bytes, piece: Piece, weights: np.ndarray) -> dict[str, Any]:
+def rewrite(arrays: glb.Glb, tree: dict[str, Any], binary: bytes, piece: PlacedPrimitive, weights: np.ndarray
+            ) -> dict[str, Any]:
     """Add a piece's surface as it stands, with blend weights (n, J); all else of its primitive stays."""
-    primitive, points = piece.primitive, piece.points
-    kept = {name: number for name, number in primitive["attributes"].items() if not name.startswith((
-        "POSITION", "NORMAL", "TANGENT", "JOINTS_", "WEIGHTS_"))}
-    if piece.tree is not tree:                                     # what was compressed is written out plain
-        kinds = {name: piece.tree["accessors"][number]["type"] for name, number in kept.items()}
-        kept = {name: arrays.add(glb.accessor(piece.tree, piece.binary, kept[name], kind), kind, glb.VERTICES)
-                for name, kind in kinds.items()}
+    primitive, attributes = piece.primitive, dict[str, int]()
+    for name, number in primitive["attributes"].items():
+        if not name.startswith(("JOINTS_", "WEIGHTS_")):
+            attributes[name] = arrays.add(piece.read(name), piece.tree["accessors"][number]["type"], glb.VERTICES,
+                                          bounds=name == "POSITION")
     joints, shares = four_carriers(weights)
-    attributes = {"POSITION": arrays.add(points, "VEC3", glb.VERTICES, bounds=True), **kept,
-                  "JOINTS_0": arrays.add_joints(joints), "WEIGHTS_0": arrays.add(shares, "VEC4", glb.VERTICES)}
-    if "NORMAL" in primitive["attributes"]:
-        attributes["NORMAL"] = arrays.add(piece.normals, "VEC3", glb.VERTICES)
-    if "TANGENT" in primitive["attributes"]:
-        tangents = piece.attribute("TANGENT")
-        handed = (-1.0) ** piece.mirrored * tangents[:, 3]
-        attributes["TANGENT"] = arrays.add(np.column_stack([unit(piece.bend(tangents[:, :3])), handed]), "VEC4",
-                                           glb.VERTICES)
+    attributes |= {"JOINTS_0": arrays.add_joints(joints), "WEIGHTS_0": arrays.add(shares, "VEC4", glb.VERTICES)}
     out = {key: value for key, value in primitive.items() if key not in ("mode", "targets", "indices")}
     extensions = {key: value for key, value in primitive.get("extensions", {}).items() if key not in DROPPED}
     out |= {"attributes": attributes, "indices": arrays.add_indices(piece.triangles), "extensions": extensions}
@@ -264,21 +256,6 @@ def embed_image(arrays: glb.Glb, source: Path, image: dict[str, Any]) -> dict[st
     kind = "image/png" if name.lower().endswith(".png") else "image/jpeg"
     added = arrays.add_png(load_bytes(glb.file_beside(source, name)), name)
     return {**{key: value for key, value in image.items() if key != "uri"}, **added, "mimeType": kind}
-
-
-@dataclass(frozen=True, eq=False)
-class Shells:
-    """The connected parts of a mesh whose vertices are welded by place."""
-
-    mesh: Mesh
-    place: np.ndarray        # (n,), the welded vertex of each vertex of the file
-
-    @staticmethod
-    def of(mesh: Mesh, width: float) -> Shells:
-        """Weld the vertices that are closer than about `width`, metres."""
-        _, first, place = np.unique(np.round(mesh.vertices / width), axis=0, return_index=True, return_inverse=True)
-        place = place.reshape(-1)
-        return Shells(Mesh(mesh.vertices[first], place[mesh.faces]), place)
 
 
 def carry_weights(statue: Statue, mesh: Mesh) -> tuple[np.ndarray, int]:
@@ -304,8 +281,10 @@ def carry_weights(statue: Statue, mesh: Mesh) -> tuple[np.ndarray, int]:
     fine = subdivide_uniform(control.mesh, control.chart, 2)
     body = Reconstruction(control, statue.map, fine).mesh()
     height = float(np.ptp(body.vertices[:, statue.upright_axis]))
-    shells = Shells.of(mesh, WELDED * height)
-    welded, shell = shells.mesh, shells.mesh.vertex_component
+    _, first, place = np.unique(np.round(mesh.vertices / (WELDED * height)), axis=0, return_index=True,
+                                return_inverse=True)
+    welded = Mesh(mesh.vertices[first], place.reshape(-1)[mesh.faces])
+    shell = welded.vertex_component
     carried = np.einsum("nc,ncj->nj", fine.bary, control.weights[control.mesh.faces[fine.parent]])
     weights = bind_points(welded, body, APART * height) @ carried
     # extent of every connected part, and its median distance from the body, at vertices and evenly over the surface
@@ -328,4 +307,4 @@ def carry_weights(statue: Statue, mesh: Mesh) -> tuple[np.ndarray, int]:
     np.add.at(mean, owner[near[most]], shares[most])
     mean /= np.maximum(mean.sum(axis=1, keepdims=True), 1e-12)
     weights = np.where(stiff[shell][:, None], mean[shell], weights)
-    return strongest(weights)[shells.place], int(stiff.sum())
+    return strongest(weights)[place.reshape(-1)], int(stiff.sum())
