@@ -56,13 +56,25 @@ def find_features(control: ControlModel, scan: Mesh, progress: Progress | None =
         raise ValueError(f"scan: expected a person of triangles or of at least 100 points, got {scan}")
     scan = sanitise(scan)
     metres, unit = person_unit(scan.vertices)
+    found = _find_features(control, scan, metres, unit, progress)
+    # a part of a person is shorter than a person: then the unit that makes it least wrong may be right
+    nearest = nearest_unit(scan.vertices)
+    if found.fit is None and metres != UNITS[nearest]:
+        part = _find_features(control, scan, UNITS[nearest], nearest, progress)
+        found = part if part.fit is not None else found
+    return found
+
+
+def _find_features(control: ControlModel, scan: Mesh, metres: float, unit: str, progress: Progress | None) -> Features:
+    """Find joint centres and landmarks in a scan with so many metres a unit."""
     data = sample_evenly(scan, metres)
-    stands = find_stand(control, data)
-    best = stands[0]
-    margin = stands[1].off / best.off
+    best, other = find_stand(control, data)
+    margin = other.off / best.off
     problem = nobody_problem(best.off, margin, unit)
     if problem:
-        return Features({}, {}, (*control.skeleton.names, *control.landmarks), None, None, problem)
+        # where they would be, to be mended by hand
+        centres = control.skeleton.joint_regressor(control.mesh) @ best.mesh.vertices / metres
+        return Features(dict(zip(control.skeleton.names[1:], centres[1:], strict=True)), {}, (), None, None, problem)
     result = register(best.mesh, data, config=RegistrationConfig(graph=RegistrationConfig().graph[-2:]),
                       start=np.eye(4), progress=progress)
     joints, points, missing = _features(control, result, data, metres)
@@ -108,11 +120,16 @@ def person_unit(points: np.ndarray) -> tuple[float, str]:
     >>> person_unit(np.diag([1750.0, 400, 200]))
     (0.001, 'mm, from the height of the body')
     """
-    longest = max(_length(points), 1e-12)
-    unit = min(UNITS, key=lambda unit: abs(np.log(longest * UNITS[unit] / TALL)))
+    longest, unit = max(_length(points), 1e-12), nearest_unit(points)
     if SMALLEST <= longest * UNITS[unit] <= LARGEST:
         return UNITS[unit], f"{unit}, from the height of the body"
     return TALL / longest, f"1 unit = {TALL / longest:.3g} m, brought to {TALL} m as no unit makes it a person's size"
+
+
+def nearest_unit(points: np.ndarray) -> str:
+    """Choose the unit in which points (n, 3) are most nearly as long as a person."""
+    longest = max(_length(points), 1e-12)
+    return min(UNITS, key=lambda unit: abs(np.log(longest * UNITS[unit] / TALL)))
 
 
 def _length(points: np.ndarray) -> float:

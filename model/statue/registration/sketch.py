@@ -1,0 +1,158 @@
+"""Sketch of the joints of an upright figure in T or A pose, by tips and notches of its silhouette.
+
+Proportions do not matter: from the front a figure is a star with five tips (head, hands, feet) and five notches between
+them (neck, armpits, crotch). Limbs run from notches to tips along the middle of the silhouette.
+"""
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import ndimage
+from scipy.spatial import cKDTree
+
+from scanprep.geometry.mesh import Mesh
+
+# metres: side of a pixel, for figures of 1.7 m; and how many points fill a silhouette (they are 6 mm apart)
+PIXEL, POINTS = 0.01, 60_000
+# shares of the way from the base of a limb to its tip where its joints are on the control model
+ARM, LEG = {"elbow": 0.38, "wrist": 0.75}, {"knee": 0.48, "ankle": 0.92}
+
+
+@dataclass(frozen=True, eq=False)
+class Silhouette:
+    """The front view of a figure: which pixels (w, h) it fills, and how deep its middle is there.
+
+    The first axis goes across from the figure's right to its left, if it faces the viewer; the second goes up.
+    """
+
+    axes: np.ndarray    # (3, 3), rows: across, up, and toward the viewer
+    origin: np.ndarray  # (2,) metres, across and up, of the first pixel
+    filled: np.ndarray  # (w, h) bool
+    depth: np.ndarray   # (w, h) metres, NaN where no point is
+    middle: int         # the column of the middle of the figure
+
+    @staticmethod
+    def draw(points: np.ndarray, axes: np.ndarray) -> Silhouette:
+        """Draw points (n, 3) in a frame."""
+        seen = points @ axes.T
+        origin = seen[:, :2].min(axis=0) - 3 * PIXEL
+        cells = np.floor((seen[:, :2] - origin) / PIXEL).astype(int)
+        shape = cells.max(axis=0) + 4
+        count = np.zeros(shape)
+        total = np.zeros(shape)
+        np.add.at(count, tuple(cells.T), 1.0)
+        np.add.at(total, tuple(cells.T), seen[:, 2])
+        with np.errstate(invalid="ignore"):
+            depth = np.where(count > 0, total / count, np.nan)
+        filled = ndimage.binary_closing(count > 0, np.ones((3, 3)))
+        label, _ = ndimage.label(filled, np.ones((3, 3)))
+        filled = label == np.bincount(label[filled]).argmax()
+        across = 0.5 * (seen[:, 0].min() + seen[:, 0].max())
+        return Silhouette(axes, origin, filled, depth, int((across - origin[0]) / PIXEL))
+
+    def place(self, pixel: np.ndarray) -> np.ndarray:
+        """Compute the point (3,) in the middle of the figure behind a pixel (2,)."""
+        i, j = np.clip(np.floor(pixel).astype(int), 0, np.array(self.filled.shape) - 1)
+        around = self.depth[max(i - 2, 0):i + 3, max(j - 2, 0):j + 3]
+        around = around if np.isfinite(around).any() else self.depth
+        return np.asarray(np.array([*(self.origin + PIXEL * (pixel + 0.5)), np.nanmean(around)]) @ self.axes)
+
+    def walk(self, starts: np.ndarray, free: np.ndarray | None = None) -> np.ndarray:
+        """Compute the way (w, h), pixels, from the nearest of the starts (n, 2) inside `free`, or else `filled`."""
+        from skimage.graph import MCP_Geometric
+
+        free = self.filled if free is None else free
+        starts = starts[free[tuple(starts.T)]]
+        if not len(starts):
+            raise ValueError("scan: its silhouette is no star of five tips")
+        return np.asarray(MCP_Geometric(np.where(free, 1.0, -1.0)).find_costs(starts.tolist())[0])
+
+    def notch(self, one: np.ndarray, other: np.ndarray) -> np.ndarray:
+        """Find the deepest pixel (2,) between two tips, seen from the line that joins them."""
+        line = np.round(np.linspace(one, other, 2 * max(self.filled.shape))).astype(int)
+        pixels = np.argwhere(~self.filled)
+        across = np.array([other[1] - one[1], one[0] - other[0]])
+        inward = ((pixels - one) @ across) * ((self.trunk - one) @ across) >= 0
+        free = np.zeros_like(self.filled)
+        free[tuple(pixels[inward].T)] = True
+        free[tuple(line[~self.filled[tuple(line.T)]].T)] = True
+        depth = self.walk(line, free)
+        side = np.sign(one[0] - self.middle)
+        here = side * (np.arange(len(depth)) - self.middle) > 0
+        depth[~(here[:, None] & np.isfinite(depth))] = -1
+        return np.array(np.unravel_index(depth.argmax(), depth.shape), dtype=float)
+
+    @property
+    def trunk(self) -> np.ndarray:
+        """(2,) the pixel in the middle of the middle column."""
+        rows = self.filled[self.middle].nonzero()[0]
+        return np.array([self.middle, rows.mean() if len(rows) else self.filled.shape[1] / 2])
+
+    def along(self, base: np.ndarray, tip: np.ndarray, shares: dict[str, float]) -> dict[str, np.ndarray]:
+        """Find places (3,) at shares of the way from the base of a limb to its tip, in the middle of the limb."""
+        from skimage.graph import route_through_array
+
+        # far from the border is cheap, so that the way is in the middle
+        cost = np.where(self.filled, (1 + ndimage.distance_transform_edt(self.filled)) ** -2.0, 1e3)
+        way = np.array(route_through_array(cost, base.astype(int), tip.astype(int))[0], dtype=float)
+        gone = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(way, axis=0), axis=1))])
+        return {name: self.place(way[np.searchsorted(gone, share * gone[-1])]) for name, share in shares.items()}
+
+
+def sketch_joints(scan: Mesh | np.ndarray) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
+    """Sketch joints and tips of limbs, {name: (3,)} each, of a figure of 1.7 m, as if it faced the viewer.
+
+    ValueError where the silhouette is no star.
+    """
+    points = scan if not isinstance(scan, Mesh) else scan.vertices if not len(scan.faces) else \
+        scan.sample(POINTS, np.random.default_rng(0))[0]
+    view = find_front(points)
+    filled, middle = view.filled, view.middle
+    columns, rows = np.arange(len(filled)), filled[middle].nonzero()[0]
+    top, crotch = np.array([middle, rows.max()]), np.array([middle, rows.min() - 1])
+    halves = {"l": (columns > middle)[:, None] & filled, "r": (columns < middle)[:, None] & filled}
+    # 1. tips: soles, and on each side the pixel that is farthest from the middle column and from the soles
+    feet = {}
+    for side, half in halves.items():
+        low = np.argwhere(half)
+        low = low[low[:, 1] <= low[:, 1].min() + 3]
+        feet[side] = low[np.linalg.norm(low - low.mean(axis=0), axis=1).argmin()]
+    far = np.minimum(view.walk(np.stack([np.full(len(rows), middle), rows], axis=1)),
+                     view.walk(np.array([*feet.values()])))
+    hands = {side: np.array(np.unravel_index(np.where(half & np.isfinite(far), far, -1).argmax(), far.shape))
+             for side, half in halves.items()}
+    # 2. joints between notches and tips
+    joints, tips, necks = {}, {"top of head": view.place(top)}, []
+    for side, half in halves.items():
+        armpit = view.notch(hands[side], feet[side])
+        necks.append(view.notch(hands[side], top)[1])
+        column = filled[int(armpit[0]), int(armpit[1]) + 1:]
+        shoulder = armpit + [0, 0.5 * np.argmin(np.append(column, False))]
+        leg = half[:, max(crotch[1], 0)].nonzero()[0]
+        hip = np.array([leg.mean() if len(leg) else middle, crotch[1] + (np.ptp(leg) if len(leg) else 0)])
+        joints |= {f"{side}_{name}": place for name, place in (
+            ("shoulder", view.place(shoulder)), ("hip", view.place(hip)),
+            *view.along(shoulder, hands[side], ARM).items(), *view.along(hip, feet[side], LEG).items())}
+        tips[{"l": "left", "r": "right"}[side] + " middle finger"] = view.place(hands[side])
+    joints["skullbase"] = view.place(np.array([middle, np.mean(necks)]))
+    return joints, tips
+
+
+def find_front(points: np.ndarray) -> Silhouette:
+    """Find the front view: the figure is symmetric across, and of the other axes the longer one is up."""
+    few = points[::max(1, len(points) // 3000)] - points.mean(axis=0)
+    tree, frames = cKDTree(few), []
+    for axes in (np.eye(3), np.linalg.svd(few, full_matrices=False)[2]):
+        order = np.argsort(np.ptp(few @ axes.T, axis=0))                    # thinnest from front to back
+        for across, up in ((order[1], order[2]), (order[2], order[1])):
+            u, v = axes[across], axes[up]
+            error = tree.query(few - 2 * np.outer(few @ u, u))[0].mean()
+            frames.append((float(error), np.array([u, v, np.cross(u, v)])))
+    # own axes of the file win unless others are clearly better
+    best = min(frames[:2], key=lambda frame: frame[0])
+    other = min(frames[2:], key=lambda frame: frame[0])
+    axes = (other if other[0] < 0.8 * best[0] else best)[1]
+    # the middle column begins higher above the feet than above the head
+    views = [Silhouette.draw(points, axes), Silhouette.draw(points, np.diag([-1, -1, 1]) @ axes)]
+    return max(views, key=lambda view: int(view.filled[view.middle].argmax()))
