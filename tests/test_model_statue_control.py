@@ -349,16 +349,10 @@ def lost_joint(tree, rest):
 
 @pytest.mark.parametrize(("change", "reason"), [
     (drop_weights, "WEIGHTS_0"), (drop_skin, "0 meshes that hang on joints"), (not_a_number, "not finite"),
-    (lost_joint, "999")])
+    (second_skeleton, "2 meshes that hang on joints"), (lost_joint, "999")])
 def test_a_glb_that_is_no_control_model_is_refused_by_name(glb, change, reason):
     with pytest.raises(StorageError, match=rf"changed\.glb.*{reason}"):
         read_control(changed(glb, change))
-
-
-def test_a_mesh_on_a_second_skeleton_is_left_out_and_said(glb):
-    with pytest.warns(UserWarning, match="left out other, which hang on another skeleton"):
-        again = read_control(changed(glb, second_skeleton))
-    assert len(again.mesh.faces) == len(humanoid().mesh.faces)
 
 
 def test_an_open_control_mesh_is_closed(glb):

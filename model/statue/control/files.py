@@ -89,12 +89,14 @@ def _read_skinned(path: Path) -> ControlModel:
         # the nodes with a mesh on joints; one skin may move several meshes, such as body and eyes
         nodes = list(glb.nodes_of(tree))
         skinned = [node for _, node, _ in nodes if "mesh" in node and "skin" in node]
-        if not skinned:
+        sizes = [sum(glb.item(tree["accessors"], primitive["attributes"]["POSITION"])["count"]
+                     for primitive in glb.item(tree["meshes"], node["mesh"])["primitives"]) for node in skinned]
+        main = skinned[int(np.argmax(sizes))]["skin"] if skinned else -1
+        on_main = sum(size for size, node in zip(sizes, skinned, strict=True) if node["skin"] == main)
+        if on_main < LEAST * sum(sizes) or not on_main:
             meshes = sum("mesh" in node for _, node, _ in nodes)
-            raise ValueError(f"found 0 meshes that hang on joints, {meshes} in all")
-        main = max(skinned, key=lambda node: sum(
-            glb.item(tree["accessors"], primitive["attributes"]["POSITION"])["count"]
-            for primitive in glb.item(tree["meshes"], node["mesh"])["primitives"]))["skin"]
+            raise ValueError(f"found {len(skinned)} meshes that hang on joints, {meshes} meshes in all; expected those "
+                             "of one skeleton")
         aside = [str(node.get("name", "unnamed")) for node in skinned if node["skin"] != main]
         if aside:
             warnings.warn(f"{path}: left out {', '.join(aside)}, which hang on another skeleton", stacklevel=2)
