@@ -15,7 +15,7 @@ from trimesh.visual.material import PBRMaterial
 from completion.__main__ import main
 from model.export.names import names_of
 from model.statue.commands import read_scan
-from model.statue.control.files import humanoid
+from model.statue.control.files import humanoid, write_control
 from model.statue.control.model import MEASURED, DisplacementMap, Statue
 from model.statue.files import body_model, save_statue
 from model.statue.motion.motions import people_motion, write_body_motion
@@ -217,3 +217,18 @@ def test_a_statue_without_or_with_another_mesh_says_what_to_do(statue, written, 
     moved = SkinnedFile(tmp_path / "out" / "own.glb")
     assert moved.bones[:2] == ["pelvis", "spine_01"] == SkinnedFile(tmp_path / "out" / "statue.glb").bones[:2]
     assert np.abs(np.concatenate(moved.vertices(1)) - np.concatenate(moved.vertices())).max() > 0.3
+
+
+def test_what_has_no_mesh_or_no_such_names_is_refused_before_the_fit(tmp_path, capsys):
+    np.savetxt(tmp_path / "cloud.xyz", HUMAN.mesh.vertices)
+    words = ["statue", "fit", str(tmp_path / "cloud.xyz"), "-o", str(tmp_path / "out"), "--own-mesh"]
+    assert main(words) == 1
+    assert "expected triangles for --own-mesh, found points" in capsys.readouterr().err
+    horse = replace(HUMAN, skeleton=replace(HUMAN.skeleton, names=tuple(f"bone{k}" for k in range(len(NAMES)))))
+    write_control(horse, tmp_path / "horse.npz")
+    write_mesh(tmp_path / "scan.ply", HUMAN.mesh)
+    (tmp_path / "features.json").write_text("{}")
+    words = ["statue", "fit", str(tmp_path / "scan.ply"), "-o", str(tmp_path / "out"), "--own-mesh", "--names", "unity",
+             "--control", str(tmp_path / "horse.npz"), "--features", str(tmp_path / "features.json")]
+    assert main(words) == 1
+    assert "names: expected a person's parts" in capsys.readouterr().err and not (tmp_path / "out").exists()

@@ -339,7 +339,7 @@ def person_segments(subject: Subject) -> SegmentAxes:
 
 def rest_joints(subject: Subject) -> np.ndarray:
     """Compute the joints (J, 3) of a person at rest, metres."""
-    return subject.joints(np.zeros((len(subject.skeleton.parents), 3)))
+    return subject.rest_skeleton.joints
 
 
 def angles_of(found: SegmentAxes, ground: np.ndarray, axes: Mapping[str, np.ndarray],

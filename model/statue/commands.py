@@ -35,7 +35,7 @@ from scanprep.surfaces.cloud import read_sound_surface
 
 from ..body import Progress, share_progress
 from ..cli import read_body
-from ..export.names import Names
+from ..export.names import Names, names_of
 from ..files import load_model
 from ..motion.onto import read_motion
 from .cli import LevelArg, MotionArg, StatueArg
@@ -57,7 +57,7 @@ from .files import BODY, body_model, load_statue, save_statue, write_body, write
 from .fit import FittedStatue, StatueConfig, UnplacedError, fit_statue
 from .motion.motions import follower_of, read_statue_motion, write_body_motion
 from .outer import cut_plinth, find_plinth, keep_outer
-from .own_mesh import OWN_MESH, animate_own_mesh, write_own_mesh
+from .own_mesh import OWN_MESH, animate_own_mesh, read_pieces, write_own_mesh
 from .registration.automatic import person_unit
 from .registration.clicks import read_features
 from .report import in_motion, motion_pictures, parts_without_data, statue_page, statue_picture
@@ -96,6 +96,8 @@ def fit(scan: ScanArg, output: Output, features: Path | None = None, control: Pa
     if names and not own_mesh:
         raise UsageError("--names: expected --own-mesh with it; scape statue animate gives statue.glb other names")
     work = Work(humanoid() if control is None else read_control(control), config, unit, cut, own_mesh, names, output)
+    if names:
+        names_of(work.control.skeleton, names)                       # a horse has none: said before the fit
     if not scan.is_dir():
         if features is None and control is not None:
             raise UsageError("--control: expected --features with joints of that control model, as only the generic "
@@ -134,6 +136,8 @@ class Work:
         """Fit the statue of some files into the folder of a room; the figures."""
         start = time.perf_counter()
         context.report_progress(0, 100)
+        if self.own_mesh:                    # what cannot be written is said before the fit
+            read_pieces(inputs.scan, 2, 1.0)
         unit = resolve_unit(inputs.scan, self.unit)
         person = self.control.skeleton.names == humanoid().skeleton.names
         scan, texture, rows, doubts, metres = read_scan(inputs, unit, person, self.cut)

@@ -8,7 +8,7 @@ import numpy as np
 
 from scanprep.console import Metric
 from scanprep.geometry import format_glb as glb
-from scanprep.geometry.files import read_mesh
+from scanprep.geometry.files import read_scan
 from scanprep.geometry.format_common import Contents, load_bytes
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.storage import StorageError, write_file
@@ -113,15 +113,8 @@ def write_own_mesh(path: Path, source: Path, metres: float, statue: Statue, name
         A file without triangles.
     """
     # 1. the pieces of the file in the axes of glTF
-    tree, binary = read_as_gltf(source)
-    is_gltf = source.suffix.lower() in (".glb", ".gltf")
-    up = glb.up_of(tree) if is_gltf else statue.upright_axis
-    frame = np.diag([metres] * 3 + [1.0])
-    frame[:3, :3] = metres * turn_up(up) @ turn_up(glb.up_of(tree)).T
-    shapes = place_pieces(source, tree, binary, frame)
+    tree, binary, up, shapes = read_pieces(source, statue.upright_axis, metres)
     pieces = [piece for _, own in shapes for piece in own]
-    if not pieces:
-        raise ValueError(f"{source}: expected triangles for --own-mesh, found points only; leave it out")
     # 2. weights of all vertices, of which those at one place have the same
     starts = np.cumsum([0, *(len(piece.read("POSITION")) for piece in pieces)])
     faces = np.concatenate([piece.triangles + start for piece, start in zip(pieces, starts, strict=False)])
@@ -145,6 +138,21 @@ def write_own_mesh(path: Path, source: Path, metres: float, statue: Statue, name
     targets = sum(len(piece.primitive.get("targets", [])) for piece in pieces)
     return [Metric("own mesh, vertices", len(points)), Metric("own mesh, loose parts that stay stiff", loose),
             *([Metric("own mesh, morph targets kept", targets)] if targets else [])]
+
+
+def read_pieces(source: Path, upright: int, metres: float) -> tuple[dict[str, Any], bytes, int, Shapes]:
+    """Read any mesh file as glTF: its tree and buffer, the axis that was turned to y, and its surface in metres.
+
+    `upright` is the axis of the file that points up, unless the file is glTF. ValueError for one without triangles.
+    """
+    tree, binary = read_as_gltf(source)
+    up = glb.up_of(tree) if source.suffix.lower() in (".glb", ".gltf") else upright
+    frame = np.diag([metres] * 3 + [1.0])
+    frame[:3, :3] = metres * turn_up(up) @ turn_up(glb.up_of(tree)).T
+    shapes = place_pieces(source, tree, binary, frame)
+    if not shapes:
+        raise ValueError(f"{source}: expected triangles for --own-mesh, found none; leave it out")
+    return tree, binary, up, shapes
 
 
 def add_meshes(arrays: glb.Glb, tree: dict[str, Any], binary: bytes, shapes: Shapes,
@@ -199,7 +207,9 @@ def read_as_gltf(path: Path) -> tuple[dict[str, Any], bytes]:
     if path.suffix.lower() == ".obj":
         data = load_with_materials(path, "load_scene")[0].export(file_type="glb")
     else:
-        mesh = read_mesh(path, "m")
+        mesh = read_scan(path, "m")
+        if not isinstance(mesh, Mesh):
+            raise ValueError(f"{path}: expected triangles for --own-mesh, found points; leave it out")
         data = glb.encode(Contents(mesh.vertices, mesh.faces, None, mesh.colors), False)
     return glb.chunks_of(path, data)
 

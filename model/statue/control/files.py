@@ -3,7 +3,6 @@ from __future__ import annotations
 
 import json
 import warnings
-from collections import Counter
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -90,16 +89,14 @@ def _read_skinned(path: Path) -> ControlModel:
         # the nodes with a mesh on joints; one skin may move several meshes, such as body and eyes
         nodes = list(glb.nodes_of(tree))
         skinned = [node for _, node, _ in nodes if "mesh" in node and "skin" in node]
-        sizes = Counter[int]()
-        for node in skinned:
-            sizes[node["skin"]] += sum(glb.item(tree["accessors"], primitive["attributes"]["POSITION"])["count"]
-                                       for primitive in glb.item(tree["meshes"], node["mesh"])["primitives"])
-        if not sizes or max(sizes.values()) < LEAST * sizes.total():
-            names = ", ".join(str(node.get("name", "unnamed")) for node in skinned)
+        sizes = [sum(glb.item(tree["accessors"], primitive["attributes"]["POSITION"])["count"]
+                     for primitive in glb.item(tree["meshes"], node["mesh"])["primitives"]) for node in skinned]
+        main = skinned[int(np.argmax(sizes))]["skin"] if skinned else -1
+        on_main = sum(size for size, node in zip(sizes, skinned, strict=True) if node["skin"] == main)
+        if on_main < LEAST * sum(sizes) or not on_main:
             meshes = sum("mesh" in node for _, node, _ in nodes)
-            raise ValueError(f"found {len(skinned)} meshes that hang on joints{f' ({names})' if names else ''}, "
-                             f"{meshes} meshes in all; expected those of one skeleton")
-        main = max(sizes, key=sizes.__getitem__)
+            raise ValueError(f"found {len(skinned)} meshes that hang on joints, {meshes} meshes in all; expected those "
+                             "of one skeleton")
         aside = [str(node.get("name", "unnamed")) for node in skinned if node["skin"] != main]
         if aside:
             warnings.warn(f"{path}: left out {', '.join(aside)}, which hang on another skeleton", stacklevel=2)
