@@ -297,3 +297,13 @@ def test_a_refused_figure_opens_with_what_was_found_and_may_be_fitted_there(pers
 def test_the_names_offered_to_be_clicked_are_those_of_the_humanoid():
     control = humanoid()
     assert set(HUMANOID) == {*control.skeleton.names[1:], *FACE} and set(FACE) <= set(control.landmarks)
+
+
+def test_a_part_of_a_person_is_sought_in_the_unit_of_its_file_too(person, tmp_path, monkeypatch):
+    upper = person.mesh.submesh(person.mesh.corners[:, :, 2].min(axis=1) > 0.9)[0]
+    write_mesh(tmp_path / "half.ply", upper)
+    heights = []
+    monkeypatch.setattr(commands, "fit_statue",
+                        lambda scan, *more: heights.append(np.ptp(scan.vertices[:, 2])) or refuse())
+    assert run("fit", tmp_path / "half.ply", "-o", tmp_path / "statue") == 1
+    assert heights == pytest.approx([1.7, np.ptp(upper.vertices[:, 2])], abs=0.1)

@@ -18,7 +18,7 @@ from scanprep.cli import MM, Output, PersonUnit, ScanArg
 from scanprep.console import Metric, Outcome, bar, judgement_of, judgement_row, write_report
 from scanprep.folders import FolderCommand, do_one, figure
 from scanprep.geometry.files import name_of, write_mesh
-from scanprep.geometry.format_common import metres_of
+from scanprep.geometry.format_common import UNITS, metres_of
 from scanprep.geometry.landmark_names import FACE
 from scanprep.geometry.landmark_writing import CLICKED_JOINTS
 from scanprep.geometry.landmarks import write_landmarks
@@ -58,7 +58,7 @@ from .fit import FittedStatue, StatueConfig, UnplacedError, fit_statue
 from .motion.motions import follower_of, read_statue_motion, write_body_motion
 from .outer import cut_plinth, find_plinth, keep_outer
 from .own_mesh import OWN_MESH, animate_own_mesh, read_pieces, write_own_mesh
-from .registration.automatic import person_unit
+from .registration.automatic import nearest_unit, person_unit
 from .registration.clicks import read_features
 from .report import in_motion, motion_pictures, parts_without_data, statue_page, statue_picture
 from .verdict import judge_statue
@@ -153,6 +153,10 @@ class Work:
             statue = fit_statue(scan, joints, points, self.control, self.config,
                                 share_progress(context.report_progress, 5, 80), context.step)
         except UnplacedError as error:
+            # a part of a person is shorter than a person: then a usual unit may be right
+            nearest = nearest_unit(scan.vertices / metres)
+            if unit is None and person and metres != UNITS[nearest]:
+                return replace(self, unit=nearest)(inputs, context)
             # a result that failed leaves no file: what was found lies with the records of the output
             found = {name: place / scale for name, place in {**error.features.joints, **error.features.points}.items()}
             file = self.output / HOME / "refused" / f"{name_of(inputs.scan)}.json"

@@ -55,13 +55,13 @@ def find_features(control: ControlModel, scan: Mesh, progress: Progress | None =
     if not len(scan.faces) and len(scan.vertices) < 100:
         raise ValueError(f"scan: expected a person of triangles or of at least 100 points, got {scan}")
     scan = sanitise(scan)
-    metres, unit = person_unit(scan.vertices)
-    found = _find_features(control, scan, metres, unit, progress)
-    # a part of a person is shorter than a person: then the unit that makes it least wrong may be right
+    # a part of a person is shorter than a person: then a usual unit may be right
     nearest = nearest_unit(scan.vertices)
-    if found.fit is None and metres != UNITS[nearest]:
-        part = _find_features(control, scan, UNITS[nearest], nearest, progress)
-        found = part if part.fit is not None else found
+    sizes = {UNITS[nearest]: nearest} | dict([person_unit(scan.vertices)])
+    for metres, unit in sizes.items():
+        found = _find_features(control, scan, metres, unit, progress)
+        if found.fit is not None:
+            break
     return found
 
 
