@@ -95,7 +95,7 @@ def find_stand(control: ControlModel, scan: Mesh | np.ndarray) -> list[Stand]:
     except ValueError:                                     # no figure that spreads its limbs
         return min(pairs, key=lambda pair: pair[0].misfit)
     sides = sketch, tuple({other_side(name) or name: place for name, place in marks.items()} for marks in sketch)
-    pairs.append(_settle(odd, [sketched_unknowns(control, odd, *marks) for marks in sides]))
+    pairs.append(_settle(odd, [pose_by_sketch(control, odd, *marks) for marks in sides]))
     return min(pairs, key=lambda pair: pair[0].misfit)
 
 
@@ -110,7 +110,7 @@ def _settle(fit: ScanFit, starts: list[np.ndarray]) -> list[Stand]:
     return sorted(stands, key=lambda stand: stand.misfit)
 
 
-def sketched_unknowns(control: ControlModel, fit: ScanFit, joints: dict[str, np.ndarray], tips: dict[str, np.ndarray]
+def pose_by_sketch(control: ControlModel, fit: ScanFit, joints: dict[str, np.ndarray], tips: dict[str, np.ndarray]
                       ) -> np.ndarray:
     """Compute the unknowns (P,) of a body of odd proportions that is posed by sketched joints and tips of limbs."""
     posed, n = fit_features(control, joints, tips), fit.body.n_angles

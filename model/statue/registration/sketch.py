@@ -17,6 +17,7 @@ from scanprep.geometry.mesh import Mesh
 PIXEL, POINTS = 0.01, 60_000
 # shares of the way from the base of a limb to its tip where its joints are on the control model
 ARM, LEG = {"elbow": 0.38, "wrist": 0.75}, {"knee": 0.48, "ankle": 0.92}
+CLEARLY = 0.8                        # principal axes count where the figure is so much more symmetric along them
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,20 +35,18 @@ class Silhouette:
 
     @staticmethod
     def draw(points: np.ndarray, axes: np.ndarray) -> Silhouette:
-        """Draw points (n, 3) in a frame."""
+        """Draw points (n, 3) in a frame; only the largest connected region counts."""
         seen = points @ axes.T
         origin = seen[:, :2].min(axis=0) - 3 * PIXEL
         cells = np.floor((seen[:, :2] - origin) / PIXEL).astype(int)
-        shape = cells.max(axis=0) + 4
-        count = np.zeros(shape)
-        total = np.zeros(shape)
+        count, total = np.zeros((2, *(cells.max(axis=0) + 4)))
         np.add.at(count, tuple(cells.T), 1.0)
         np.add.at(total, tuple(cells.T), seen[:, 2])
         with np.errstate(invalid="ignore"):
             depth = np.where(count > 0, total / count, np.nan)
         filled = ndimage.binary_closing(count > 0, np.ones((3, 3)))
-        label, _ = ndimage.label(filled, np.ones((3, 3)))
-        filled = label == np.bincount(label[filled]).argmax()
+        region, _ = ndimage.label(filled, np.ones((3, 3)))
+        filled = region == np.bincount(region[filled]).argmax()
         across = 0.5 * (seen[:, 0].min() + seen[:, 0].max())
         return Silhouette(axes, origin, filled, depth, int((across - origin[0]) / PIXEL))
 
@@ -59,7 +58,10 @@ class Silhouette:
         return np.asarray(np.array([*(self.origin + PIXEL * (pixel + 0.5)), np.nanmean(around)]) @ self.axes)
 
     def walk(self, starts: np.ndarray, free: np.ndarray | None = None) -> np.ndarray:
-        """Compute the way (w, h), pixels, from the nearest of the starts (n, 2) inside `free`, or else `filled`."""
+        """Compute the way (w, h), pixels, from the nearest of the starts (n, 2) inside `free`, or else `filled`.
+
+        ValueError where no start is inside.
+        """
         from skimage.graph import MCP_Geometric
 
         free = self.filled if free is None else free
@@ -68,18 +70,19 @@ class Silhouette:
             raise ValueError("scan: its silhouette is no star of five tips")
         return np.asarray(MCP_Geometric(np.where(free, 1.0, -1.0)).find_costs(starts.tolist())[0])
 
-    def notch(self, one: np.ndarray, other: np.ndarray) -> np.ndarray:
-        """Find the deepest pixel (2,) between two tips, seen from the line that joins them."""
-        line = np.round(np.linspace(one, other, 2 * max(self.filled.shape))).astype(int)
-        pixels = np.argwhere(~self.filled)
-        across = np.array([other[1] - one[1], one[0] - other[0]])
-        inward = ((pixels - one) @ across) * ((self.trunk - one) @ across) >= 0
+    def notch(self, tip: np.ndarray, other: np.ndarray) -> np.ndarray:
+        """Find the deepest pixel (2,) between two tips, seen from the line that joins them, on the side of the first.
+        """
+        line = np.round(np.linspace(tip, other, 2 * max(self.filled.shape))).astype(int)
+        across = np.array([other[1] - tip[1], tip[0] - other[0]])
+        # what is free between the line and the trunk
+        empty = np.argwhere(~self.filled)
+        inward = ((empty - tip) @ across) * ((self.trunk - tip) @ across) >= 0
         free = np.zeros_like(self.filled)
-        free[tuple(pixels[inward].T)] = True
+        free[tuple(empty[inward].T)] = True
         free[tuple(line[~self.filled[tuple(line.T)]].T)] = True
         depth = self.walk(line, free)
-        side = np.sign(one[0] - self.middle)
-        here = side * (np.arange(len(depth)) - self.middle) > 0
+        here = np.sign(tip[0] - self.middle) * (np.arange(len(depth)) - self.middle) > 0
         depth[~(here[:, None] & np.isfinite(depth))] = -1
         return np.array(np.unravel_index(depth.argmax(), depth.shape), dtype=float)
 
@@ -89,7 +92,7 @@ class Silhouette:
         rows = self.filled[self.middle].nonzero()[0]
         return np.array([self.middle, rows.mean() if len(rows) else self.filled.shape[1] / 2])
 
-    def along(self, base: np.ndarray, tip: np.ndarray, shares: dict[str, float]) -> dict[str, np.ndarray]:
+    def divide_limb(self, base: np.ndarray, tip: np.ndarray, shares: dict[str, float]) -> dict[str, np.ndarray]:
         """Find places (3,) at shares of the way from the base of a limb to its tip, in the middle of the limb."""
         from skimage.graph import route_through_array
 
@@ -103,13 +106,35 @@ class Silhouette:
 def sketch_joints(scan: Mesh | np.ndarray) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
     """Sketch joints and tips of limbs, {name: (3,)} each, of a figure of 1.7 m, as if it faced the viewer.
 
-    ValueError where the silhouette is no star.
+    Parameters
+    ----------
+    scan : Mesh or (n, 3) float, metres
+        A figure that spreads its limbs; axes, front and proportions need not be known.
+
+    Returns
+    -------
+    joints, tips : dict of str to (3,) float, metres
+        As the control model names them. Left and right are exchanged where the figure faces away.
+
+    Raises
+    ------
+    ValueError
+        The silhouette is no star.
+
+    Examples
+    --------
+    >>> from scanprep.synthetic.people import SyntheticPerson
+    >>> joints, tips = sketch_joints(SyntheticPerson().mesh)
+    >>> sorted(tips)
+    ['left middle finger', 'right middle finger', 'top of head']
     """
     points = scan if not isinstance(scan, Mesh) else scan.vertices if not len(scan.faces) else \
         scan.sample(POINTS, np.random.default_rng(0))[0]
     view = find_front(points)
     filled, middle = view.filled, view.middle
     columns, rows = np.arange(len(filled)), filled[middle].nonzero()[0]
+    if not len(rows):
+        raise ValueError("scan: its silhouette is no star of five tips")
     top, crotch = np.array([middle, rows.max()]), np.array([middle, rows.min() - 1])
     halves = {"l": (columns > middle)[:, None] & filled, "r": (columns < middle)[:, None] & filled}
     # 1. tips: soles, and on each side the pixel that is farthest from the middle column and from the soles
@@ -122,18 +147,19 @@ def sketch_joints(scan: Mesh | np.ndarray) -> tuple[dict[str, np.ndarray], dict[
                      view.walk(np.array([*feet.values()])))
     hands = {side: np.array(np.unravel_index(np.where(half & np.isfinite(far), far, -1).argmax(), far.shape))
              for side, half in halves.items()}
-    # 2. joints between notches and tips
-    joints, tips, necks = {}, {"top of head": view.place(top)}, []
+    # 2. joints between notches and tips: the hip is as high above the crotch as the thigh is wide
+    joints = dict[str, np.ndarray]()
+    tips, necks = {"top of head": view.place(top)}, list[float]()
     for side, half in halves.items():
         armpit = view.notch(hands[side], feet[side])
         necks.append(view.notch(hands[side], top)[1])
-        column = filled[int(armpit[0]), int(armpit[1]) + 1:]
-        shoulder = armpit + [0, 0.5 * np.argmin(np.append(column, False))]
-        leg = half[:, max(crotch[1], 0)].nonzero()[0]
-        hip = np.array([leg.mean() if len(leg) else middle, crotch[1] + (np.ptp(leg) if len(leg) else 0)])
+        above = filled[int(armpit[0]), int(armpit[1]) + 1:]
+        shoulder = armpit + [0, 0.5 * np.argmin(np.append(above, False))]
+        thigh = half[:, max(crotch[1], 0)].nonzero()[0]
+        hip = np.array([middle, crotch[1]]) if not len(thigh) else np.array([thigh.mean(), crotch[1] + np.ptp(thigh)])
         joints |= {f"{side}_{name}": place for name, place in (
             ("shoulder", view.place(shoulder)), ("hip", view.place(hip)),
-            *view.along(shoulder, hands[side], ARM).items(), *view.along(hip, feet[side], LEG).items())}
+            *view.divide_limb(shoulder, hands[side], ARM).items(), *view.divide_limb(hip, feet[side], LEG).items())}
         tips[{"l": "left", "r": "right"}[side] + " middle finger"] = view.place(hands[side])
     joints["skullbase"] = view.place(np.array([middle, np.mean(necks)]))
     return joints, tips
@@ -142,17 +168,17 @@ def sketch_joints(scan: Mesh | np.ndarray) -> tuple[dict[str, np.ndarray], dict[
 def find_front(points: np.ndarray) -> Silhouette:
     """Find the front view: the figure is symmetric across, and of the other axes the longer one is up."""
     few = points[::max(1, len(points) // 3000)] - points.mean(axis=0)
-    tree, frames = cKDTree(few), []
+    tree, frames = cKDTree(few), list[tuple[float, np.ndarray]]()
     for axes in (np.eye(3), np.linalg.svd(few, full_matrices=False)[2]):
         order = np.argsort(np.ptp(few @ axes.T, axis=0))                    # thinnest from front to back
         for across, up in ((order[1], order[2]), (order[2], order[1])):
-            u, v = axes[across], axes[up]
-            error = tree.query(few - 2 * np.outer(few @ u, u))[0].mean()
-            frames.append((float(error), np.array([u, v, np.cross(u, v)])))
+            side, high = axes[across], axes[up]
+            unlike = tree.query(few - 2 * np.outer(few @ side, side))[0].mean()
+            frames.append((float(unlike), np.array([side, high, np.cross(side, high)])))
     # own axes of the file win unless others are clearly better
     best = min(frames[:2], key=lambda frame: frame[0])
-    other = min(frames[2:], key=lambda frame: frame[0])
-    axes = (other if other[0] < 0.8 * best[0] else best)[1]
+    principal = min(frames[2:], key=lambda frame: frame[0])
+    axes = (principal if principal[0] < CLEARLY * best[0] else best)[1]
     # the middle column begins higher above the feet than above the head
     views = [Silhouette.draw(points, axes), Silhouette.draw(points, np.diag([-1, -1, 1]) @ axes)]
     return max(views, key=lambda view: int(view.filled[view.middle].argmax()))
