@@ -14,6 +14,7 @@ from model.statue.registration.automatic import Features, find_features, person_
 from model.statue.registration.clicks import MedialAxis
 from model.statue.registration.features import feature_misfit, fit_features, head_share, warp
 from model.statue.registration.person_search import LENGTH, control_body
+from model.statue.registration.sketch import sketch_joints
 from scanprep.geometry import rotations
 from scanprep.geometry.mesh import Mesh
 from scanprep.synthetic.people import BodyShape, SyntheticPerson, compose_pose
@@ -308,6 +309,25 @@ def test_a_person_is_found_upside_down_in_millimetres_with_holes_and_without_an_
     apart = [np.linalg.norm(found.points[name] - seen(vertices[people.LANDMARKS[name]])) for name in FACE]
     assert np.mean(apart) < 25
     assert found.fit.joint_rms < 25
+
+
+def test_joints_of_a_big_head_on_short_legs_are_sketched():
+    person = SyntheticPerson()
+    pose = compose_pose(left_arm={"direction": (1, 0, -0.4)}, right_arm={"direction": (1, 0, -0.4)},
+                        left_leg={"direction": (0.15, 0, -1)}, right_leg={"direction": (0.15, 0, -1)})
+    vertices, joints = person.in_pose(pose), person.joints_in_pose(pose)
+    hips, neck = joints[[10, 13]].mean(axis=0), joints[3]
+
+    def distort(points):
+        """Legs of 0.6 their length, the head twice as large."""
+        z = points[:, 2:] - hips[2]
+        out = np.hstack([points[:, :2], np.where(z < 0, 0.6 * z, z) + hips[2]])
+        return np.where(points[:, 2:] > neck[2], neck + 2 * (out - neck), out)
+
+    found, _ = sketch_joints(Mesh(distort(vertices), person.mesh.faces))
+    there = distort(joints)
+    for name, part in {"l_elbow": 5, "l_wrist": 6, "r_elbow": 8, "l_hip": 10, "l_knee": 11, "r_knee": 14}.items():
+        assert np.linalg.norm(found[name] - there[part]) < 0.1, name
 
 
 @pytest.mark.slow
