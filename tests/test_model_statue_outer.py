@@ -79,7 +79,7 @@ def test_triangles_may_be_long_and_unwelded(person):
 
 def test_reading_a_scan_says_what_was_left_out(person, tmp_path):
     write_mesh(tmp_path / "scan.ply", join(person.mesh, *teeth(person)))
-    body, _, rows, _ = read_scan(ScanTask("scan", tmp_path / "scan.ply"), None)
+    body, _, rows, *_ = read_scan(ScanTask("scan", tmp_path / "scan.ply"), None)
     assert body.face_areas.sum() == pytest.approx(person.mesh.face_areas.sum())
     assert [row.value for row in rows if row.name == "inside the surface, left out"] == [pytest.approx(0.11, abs=0.05)]
 
@@ -89,7 +89,7 @@ def test_a_plinth_of_twelve_triangles_stays_behind_and_the_soles_stay(person, tm
     """It became two feet: eight vertices are no floor."""
     body = person.mesh.with_vertices(person.mesh.vertices - [0, 0, person.mesh.vertices[:, 2].min()])
     write_mesh(tmp_path / "scan.ply", join(body, box((0, 0, -height / 2), (width, width, height))))
-    found, _, rows, _ = read_scan(ScanTask("scan", tmp_path / "scan.ply"), None, cut)
+    found, _, rows, *_ = read_scan(ScanTask("scan", tmp_path / "scan.ply"), None, cut=cut)
     assert -0.001 < found.vertices[:, 2].min() < 0.005        # metres
     assert found.face_areas.sum() == pytest.approx(body.face_areas.sum(), rel=0.03)
     assert any(row.name == "plinth, left out" for row in rows)
@@ -112,11 +112,11 @@ def test_box_shaped_shoes_are_no_plinth(person, tmp_path):
     """Their soles were taken for a floor: no vertex of the shoes lay near them."""
     shoes = [box((x, -0.05, 0.06), (0.16, 0.42, 0.12)) for x in (-0.19, 0.19)]
     write_mesh(tmp_path / "scan.ply", join(person.mesh, *shoes))
-    body, _, rows, _ = read_scan(ScanTask("scan", tmp_path / "scan.ply"), None)
+    body, _, rows, *_ = read_scan(ScanTask("scan", tmp_path / "scan.ply"), None)
     assert body.vertices[:, 2].min() == pytest.approx(0) and not any("plinth" in row.name for row in rows)
 
 
 def test_a_cut_above_the_figure_is_refused(person, tmp_path):
     write_mesh(tmp_path / "scan.ply", person.mesh)
     with pytest.raises(ValueError, match="cut: expected a height below that of the scan"):
-        read_scan(ScanTask("scan", tmp_path / "scan.ply"), None, 2.5)
+        read_scan(ScanTask("scan", tmp_path / "scan.ply"), None, cut=2.5)

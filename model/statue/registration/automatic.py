@@ -52,8 +52,8 @@ def find_features(control: ControlModel, scan: Mesh, progress: Progress | None =
     Unit and axes of the scan need not be known. It may have holes, or show a part of a person. The control model, z up
     and facing -y, is placed in many ways; the best are posed to fit the scan, and one of them is registered.
     """
-    if not len(scan.faces) and len(scan.vertices) < 100:
-        raise ValueError(f"scan: expected a person of triangles or of at least 100 points, got {scan}")
+    if max(len(scan.vertices), len(scan.faces)) < 100:
+        raise ValueError(f"scan: expected a person of at least 100 points, got {scan}")
     scan = sanitise(scan)
     # a part of a person is shorter than a person: then a usual unit may be right
     nearest = nearest_unit(scan.vertices)
