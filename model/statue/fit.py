@@ -79,6 +79,7 @@ class Posed:
     hidden: np.ndarray             # (N,), vertices of parts that the scan does not show
     face: int = 0                  # points of the face that shaped the head: none where fewer than four are known
     missing: tuple[str, ...] = ()  # joints and landmarks that the scan does not show
+    searched: bool = False         # whether the features were found; else they were given
     problem: str | None = None     # why features that were found should not be trusted
 
 
@@ -182,7 +183,8 @@ def pose_automatically(control: ControlModel, found: Features, registered: bool 
         raise UnplacedError(f"scan: {found.problem}", found)
     posed, names = with_head(control, found.fit, found.points), control.skeleton.names
     lacking = control.weights[:, [j for j, name in enumerate(names) if name in found.missing]].sum(axis=1)
-    posed = replace(posed, hidden=lacking > 0.5, missing=found.missing, problem=found.problem)
+    posed = replace(posed, hidden=lacking > 0.5, missing=found.missing, problem=found.problem,
+                    searched=True)
     if not registered:
         return posed
     surface = found.registered.vertices
