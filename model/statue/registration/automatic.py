@@ -20,12 +20,8 @@ from ...body import Progress
 from ..control.model import ControlModel
 from ..detail.subdivision import divide_long_edges
 from .features import FeatureFit, fit_features
-from .person_search import find_stand
+from .person_search import Stand, find_stand, shows_person
 
-# Largest distance, metres, of the posed body from a scan, and least ratio of that distance when it faces another way.
-# Six synthetic persons: 11 to 13 mm, ratio 1.7 to 3.3. Nine real ones, five of them bent: 18 to 21 mm, 1.5 to 2.9.
-# Fronts and sides alone: 21 mm, 1.35 to 1.6. A cylinder: 47 mm, 1.13; a chair: 56 mm; two people: 65 and 70 mm.
-OFF, MARGIN = 0.042, 1.05
 # metres: length of a person, and the range in which a file's own unit is believed; others are seldom people
 TALL, SMALLEST, LARGEST = 1.7, 1.07, 2.31
 # metres: edges of the control model are 40 mm. At 25 mm a person of 800 triangles gives the joints of the full mesh
@@ -69,8 +65,7 @@ def _find_features(control: ControlModel, scan: Mesh, metres: float, unit: str, 
     """Find joint centres and landmarks in a scan with so many metres a unit."""
     data = sample_evenly(scan, metres)
     best, other = find_stand(control, data)
-    margin = other.off / best.off
-    problem = nobody_problem(best.off, margin, unit)
+    problem = nobody_problem(best, other, unit)
     if problem:
         # where they would be, to be mended by hand
         centres = control.skeleton.joint_regressor(control.mesh) @ best.mesh.vertices / metres
@@ -80,7 +75,7 @@ def _find_features(control: ControlModel, scan: Mesh, metres: float, unit: str, 
     joints, points, missing = _features(control, result, data, metres)
     fit = fit_features(control, joints, points) if len(joints) + len(points) > 2 else None
     registered = control.mesh.with_vertices(result.mesh.vertices / metres)
-    problem = why_uncertain(margin) if fit else (
+    problem = why_uncertain(other.off / best.off) if fit else (
         f"{number_of(len(joints), 'joint')} and {number_of(len(points), 'point')} of the face have data around them, "
         "too few to place a person: "
         "a part of one only?")
@@ -93,14 +88,13 @@ def sample_evenly(scan: Mesh, metres: float) -> Mesh | np.ndarray:
     return scan if len(scan.vertices) < 40_000 else scan.vertices[thin(scan.vertices, 0.007)]
 
 
-def nobody_problem(off: float, margin: float, size: str) -> str | None:
+def nobody_problem(best: Stand, other: Stand, size: str) -> str | None:
     """Explain why there is no person in a scan, or none that stands upright; None where there is one."""
-    if off <= OFF and margin >= MARGIN:
+    if shows_person(best, other):
         return None
     return (f"no person who stands upright was found (the unit taken for {size}): a body bent onto the scan stays "
-            f"{1000 * off:.0f} mm off, and {margin:.2f} times as far when it faces another way; something else, "
-            "several people, a pedestal, a pose that needs clicks, or, if photographs without a scale made it, to be "
-            "brought to metres first?")
+            f"{1000 * best.off:.0f} mm off, and {other.off / best.off:.2f} times as far when it faces another way; "
+            "something else, several people, a pedestal, or a pose that needs joints by hand?")
 
 
 def why_uncertain(margin: float) -> str | None:
