@@ -11,7 +11,6 @@ from model.statue.fit import StatueConfig, pose_automatically, pose_by_features
 from model.statue.registration import automatic
 from model.statue.registration.articulated import Articulated, BoundPoints
 from model.statue.registration.automatic import Features, find_features, person_unit
-from model.statue.registration.clicks import MedialAxis
 from model.statue.registration.features import feature_misfit, fit_features, head_share, warp
 from model.statue.registration.person_search import LENGTH, control_body
 from model.statue.registration.sketch import sketch_joints
@@ -216,34 +215,6 @@ def test_features_that_were_found_pose_and_warp_as_those_that_were_clicked(contr
     head = head_share(control) == 1
     np.testing.assert_allclose(hidden.start[head], clicked.start[head], atol=1e-12)
     assert (usual.face, hidden.face) == (0, len(FACE)) and hidden.hidden[head].all()
-
-
-def test_a_click_on_a_cylinder_finds_its_axis_though_it_has_holes():
-    whole = cylinder(0.06, 0.5)
-    pierced = whole.submesh(np.arange(len(whole.faces)) % 37 != 5)[0]
-    for mesh in (whole, pierced):
-        medial = MedialAxis(mesh, 0.01)
-        for way in ([1.0, 0, 0], [0.6, 0.8, 0], [2.0, 1, 0.5]):
-            along = np.array(way) / np.linalg.norm(way)
-            origin = np.array([0.004, 0, 0.25]) - 3 * along
-            found = medial.nearest_to_ray(origin, np.array(way))
-            assert np.linalg.norm(found[:2]) < 0.015
-            np.testing.assert_allclose(np.cross(found - origin, along), 0, atol=1e-9)
-            np.testing.assert_allclose(medial.nearest_to_ray(origin, np.array(way), 0.03), found + 0.03 * along)
-    with pytest.raises(ValueError, match="does not meet"):
-        medial.nearest_to_ray(np.array([1.0, 1, 5]), np.array([1.0, 0, 0]))
-    with pytest.raises(ValueError, match="metres"):
-        MedialAxis(whole.with_vertices(1000 * whole.vertices))
-
-
-def test_a_click_on_a_limb_finds_its_bone(control):
-    medial, o, names = MedialAxis(control.mesh), control.skeleton.joints, control.skeleton.names
-    # calves lie behind the line from knee to ankle, the flesh of upper arms behind their bone
-    for first, second, most in (("l_shoulder", "l_elbow", 0.025), ("r_elbow", "r_wrist", 0.015),
-                                ("l_knee", "l_ankle", 0.030)):
-        middle = 0.5 * (o[names.index(first)] + o[names.index(second)])
-        for way in (np.array([0.0, 1, 0]), np.array([0.3, -1, 0.1])):
-            assert np.linalg.norm(medial.nearest_to_ray(middle - 2 * way, way) - middle) < most
 
 
 @pytest.mark.parametrize(("length", "metres"), [(1.8, 1.0), (1750, 0.001), (171, 0.01), (70, 0.0254)])

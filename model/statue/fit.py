@@ -53,8 +53,8 @@ class StatueConfig(Settings):
         """Return the paper's settings: the control model posed by features, its head warped, its mesh fitted as there.
 
         Not as in the paper: without --features, a search finds joints and landmarks, which the paper has clicked. Eq. 4
-        has a weak prior (1 mm for a radian or a double length), and Eq. 5 the φ(p - p_k) that interpolates. A click on
-        a picture goes to medial curves of the body, not to its medial surface. The shape carries vertices past the edge
+        has a weak prior (1 mm for a radian or a double length), and Eq. 5 the φ(p - p_k) that interpolates. A click in
+        the browser goes half way through the body, not to its medial surface. The shape carries vertices past the edge
         of a hole of the scan. Folds that remain after the fit are opened. Heights solve the cubic of Eq. 19, and are
         filled smoothly where there is no solution. Adaptive triangles are small where the displaced surface is curved,
         not where the displacement is large.
