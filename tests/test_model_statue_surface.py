@@ -7,12 +7,13 @@ from scipy.sparse import csc_array, diags_array, eye_array
 from scipy.spatial import ConvexHull
 from scipy.special import logsumexp
 
+from model.statue.fit import spread_flat
 from model.statue.registration.local_shape import local_shape
 from model.statue.registration.soft_assignment import DirectedPoints, assign_softly
 from model.statue.registration.surface_fit import SurfaceFitConfig, fit_surface
 from scanprep.alignment.icp import align_landmarks, apply
 from scanprep.geometry import rotations
-from scanprep.geometry.mesh import Mesh
+from scanprep.geometry.mesh import Mesh, template_problem
 from scanprep.geometry.sparse import Factored, conjugate_gradients
 from scanprep.geometry.surface import Surface
 
@@ -225,3 +226,15 @@ def test_what_cannot_be_fitted_is_told(body, scanned):
     short = fit_surface(body, start, scanned, SurfaceFitConfig(most=1, step="explicit", cooling=0.01, polish=0,
                                                                reach=10.0))
     assert not short.converged and short.rms > 10 * whole.rms
+
+
+def test_vertices_that_met_on_a_corner_are_spread_again(body):
+    assert spread_flat(body) is body
+    x, (a, b) = body.vertices.copy(), body.edges[7]
+    x[a] = x[b]
+    met = body.with_vertices(x)
+    spread = spread_flat(met)
+    assert template_problem(met) and template_problem(spread) is None
+    moved = np.flatnonzero((spread.vertices != met.vertices).any(axis=1))
+    assert {a, b} <= set(moved) and len(moved) < 6
+    assert np.linalg.norm(spread.vertices - met.vertices, axis=1).max() < body.edge_lengths.max()

@@ -6,6 +6,7 @@ from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import numpy as np
+from scipy.sparse import csr_array, diags_array
 
 from scanprep.batch.room import Step, run_uncached
 from scanprep.geometry.landmark_names import FACE
@@ -195,6 +196,24 @@ def pose_automatically(control: ControlModel, found: Features, registered: bool 
 def fit_control(control: ControlModel, posed: FeatureFit, surface: SurfaceFit, scan: Mesh,
                 config: DisplacementConfig | None = None) -> ControlModel:
     """Build the control model on the scan, with folds opened and its joints where the features put them."""
-    unfolded = unfold_control(control.refit(surface.vertices, posed.joints), scan, config).mesh.vertices
+    unfolded = spread_flat(unfold_control(control.refit(surface.vertices, posed.joints), scan, config).mesh).vertices
     root = unfolded[control.skeleton.part_of_vertex(control.mesh) == 0].mean(axis=0)
     return control.refit(unfolded, np.vstack([root, posed.joints[1:]]))
+
+
+def spread_flat(mesh: Mesh) -> Mesh:
+    """Move corners of triangles without area towards the mean of their neighbours, a tenth of the way at a time.
+
+    On sharp corners of a scan vertices may meet, and a control mesh with such triangles cannot be read again.
+    """
+    near = csr_array(mesh.vertex_adjacency != 0, dtype=float)
+    near = diags_array(1 / near.sum(axis=1)) @ near
+    least, rounds = 1e-10, 30                                   # square metres: a hundred times what readers refuse
+    for _ in range(rounds):
+        flat = mesh.face_areas < least
+        if not flat.any():
+            break
+        moved, corners = mesh.vertices.copy(), np.unique(mesh.faces[flat])
+        moved[corners] += 0.1 * (near @ moved - moved)[corners]
+        mesh = mesh.with_vertices(moved)
+    return mesh
