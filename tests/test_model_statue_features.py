@@ -318,7 +318,7 @@ def test_a_ball_is_no_person(control):
     r = np.sqrt(1 - z**2)
     points = 0.8 * np.stack([r * np.cos(t), r * np.sin(t), z], axis=-1).reshape(-1, 3)
     found = find_features(control, Mesh(points, np.zeros((0, 3), dtype=int)))
-    assert "no person" in found.problem and not found.joints and not found.points
+    assert "no person" in found.problem and found.fit is None and found.registered is None and not found.points
     with pytest.raises(ValueError, match="100 points"):
         find_features(control, Mesh(points[:50], np.zeros((0, 3), dtype=int)))
 
