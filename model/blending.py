@@ -130,7 +130,7 @@ class BlendedTemplate:
         # the tables of every part, one after the other, for each shape component
         flat = np.empty((shapes.count, sum(table.size for table in mean.tables)))
         for p, some in enumerate(slices([table.size for table in mean.tables])):
-            flat[:, some] = self._tables(space, shapes.components, p).reshape(shapes.count, -1)
+            flat[:, some] = self._tables(space, shapes.components, p).reshape(shapes.count, some.stop - some.start)
         return ShapedCondensed(own, mean, flat)
 
     def _tables(self, space: PoseSpace, S: np.ndarray, p: int) -> np.ndarray:

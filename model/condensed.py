@@ -347,7 +347,7 @@ class ShapedCondensed(ShapedPoints):
             batch = slice(start, start + AT_ONCE // 3)
             flat, local = betas[batch] @ self.flat[:betas.shape[1]], []
             for products, chosen, table in zip(mean.products_of_part, self._slices, mean.tables, strict=True):
-                tables = (flat[:, chosen] + table.ravel()).reshape(len(flat), -1, table.shape[2])
+                tables = (flat[:, chosen] + table.ravel()).reshape(len(flat), 3 * len(table), table.shape[2])
                 rows = W[batch][:, :, products].reshape(len(flat), 3, -1) @ tables
                 local.append(rows.reshape(-1, table.shape[2]))
             out[batch] = np.swapaxes(assemble_vertices(mean.system, local).reshape(len(flat), 3, -1), 1, 2)
@@ -364,7 +364,7 @@ class ShapedCondensed(ShapedPoints):
         # the same products as for a body, times the change of the tables by each beta
         local = []
         for products, flat, table in zip(self.mean.products_of_part, self._slices, self.mean.tables, strict=True):
-            change = self.flat[:, flat].reshape(K, -1, table.shape[2])
+            change = self.flat[:, flat].reshape(K, 3 * len(table), table.shape[2])
             rows = W[:, products].reshape(len(W), 1, 1, -1) @ change                            # (B 3, K, 1, rows)
             local.append(rows.reshape(-1, table.shape[2]))
         y = assemble_vertices(self.mean.system, local).reshape(*pose.shape[:-2], 3, K, self.count)

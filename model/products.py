@@ -193,8 +193,7 @@ class ShapedProducts(ShapedPoints):
         return replace(self, own=own, mean=mean, change=change)
 
     def along(self, directions: np.ndarray) -> ShapedProducts:
-        K, change = len(directions), self.change
-        return replace(self, change=(directions @ change.reshape(len(change), -1)).reshape(K, *change.shape[1:]))
+        return replace(self, change=np.tensordot(directions, self.change, axes=1))
 
     def first(self, n_betas: int) -> ShapedProducts:
         return replace(self, change=self.change[:n_betas])

@@ -156,7 +156,7 @@ class ScapeModel(BodyModel):
         by_R = np.tensordot(weights, np.swapaxes(pulled, -1, -2) @ (posed @ np.swapaxes(S, -1, -2)), axes=(0, 0))
         # 3. S is linear in the betas, Q in the features
         components = self.shape_space.components[:len(betas)]
-        by_betas = components.reshape(len(components), -1) @ by_S.ravel().astype(components.dtype)
+        by_betas = components.reshape(len(components), by_S.size) @ by_S.ravel().astype(components.dtype)
         delta = np.concatenate([a.reshape(len(a), -1) @ by_Q[faces].ravel() for faces, a in
                                 zip(space.faces_of_part, space.coefficients, strict=True)])
         # 4. a turn ω of part p changes R_p by hat(ω) R_p, and turns all that hangs below it

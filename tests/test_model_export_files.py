@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from bvh_reader import Bvh
+from conformance_bodies import blendscape_worm, scape_worm, skinned_worm
 from exported_worms import BETAS, worm, worm_motion, worm_rig  # noqa: F401 -- fixtures
 from glb_reader import Glb
 from model_bodies import random_poses, worm_model
@@ -14,6 +15,7 @@ from model.export.correctives import motion_correctives, pose_directions, pose_f
 from model.export.glb import continuous_quaternions, encode_skinned_glb, write_skinned_glb
 from model.motion.onto import BodyMotion
 from model.rig import turn_up
+from model.shape_space import ShapeSpace
 from scanprep.command_line import run
 from scanprep.console import Metric
 from scanprep.geometry import rotations
@@ -274,3 +276,26 @@ def test_motions_of_other_bodies_are_refused(model, tmp_path, change, words):
         return
     with pytest.raises(StorageError, match=words):
         read_motion(tmp_path / "m.npz", model)
+
+
+@pytest.mark.parametrize("betas", [0, 3])
+@pytest.mark.parametrize("name", ["scape", "blendscape", "skinning"])
+def test_every_kind_of_model_exports_to_every_format(name, betas, tmp_path):
+    body = {"scape": scape_worm, "blendscape": blendscape_worm, "skinning": lambda: skinned_worm(True)}[name]()
+    if betas == 0 and name == "skinning":
+        body = replace(body, shape_components=body.shape_components[:0],
+                       shape_variances=body.shape_variances[:0])
+    elif betas == 0:
+        body = replace(body, shape_space=ShapeSpace.empty(len(body.template.faces)))
+    body.save(tmp_path / "model.npz")
+    for ending in ("glb", "bvh", "npz", "ply", "obj", "stl", "off"):
+        exported(tmp_path, f"body.{ending}")
+    # at rest every file holds the mean person, who is the template where a model has no betas
+    rest, mean = np.zeros((4, 3)), body.mean_subject
+    assert mean.betas.shape == (betas,)
+    assert np.abs(read_mesh(tmp_path / "body.ply", "m").vertices - mean.vertices(rest)).max() < 1e-6
+    arrays = dict(np.load(tmp_path / "body.npz"))
+    assert arrays["shapedirs"].shape[-1] == betas
+    assert np.abs(arrays["v_template"] - mean.vertices(rest)).max() < 1e-6
+    assert body.shape_jacobian(rest).shape == (*body.template.vertices.shape, betas)
+    assert np.allclose(body.points(np.arange(4)).operator(np.zeros(betas)).evaluate(rest), mean.vertices(rest)[:4])

@@ -92,9 +92,7 @@ def export(model: ModelArg, output: Output, betas: tuple[Beta, ...] = (), own_bo
         moves = moves.at_rate(fps)
     if own_body and betas:
         raise UsageError("--own-body: the template's own body has no betas")
-    person = np.array(betas) if betas else None if own_body else moves.betas if moves is not None else np.zeros(1)
-    if person is not None and not loaded.n_betas and "betas" in writer.takes:
-        raise ValueError(f"{model}: it has no shape components; ask for --own-body")
+    person = np.array(betas) if betas else None if own_body else moves.betas if moves is not None else np.zeros(0)
     order = Order(output, model, loaded, person, moves, shapes, correctives, unit or "cm",
                   None if up is None else "xyz".index(up), root, names, ground, front)
     judgement = Judgement.of(check=moves.doubts if moves is not None else ())
@@ -161,11 +159,10 @@ def _npz(order: Order) -> list[Metric]:
         return [_size(order.output), Metric("frames", len(moves.poses)), Metric("rate", moves.rate, "1/s"),
                 Metric("surface_model_type", family)]
     arrays = write_body_npz(order.output, model)
-    mean = np.zeros(1) if model.n_betas else None
-    rig = make_rig(model, mean)
+    rig = make_rig(model, np.zeros(0))
     # the error against the exact model, with and without pose correctives
     poses = sample_poses(model, MEASURED, np.random.default_rng(1))      # not those of the fit
-    exact = model.subject(mean).vertices(poses)
+    exact = model.mean_subject.vertices(poses)
     changes = np.tensordot(pose_features(poses), arrays["posedirs"], axes=(1, 2))
     return [_size(order.output), Metric("joints", len(model.skeleton.parents)),
             Metric("shape directions", model.n_betas),

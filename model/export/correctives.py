@@ -174,7 +174,7 @@ def write_body_npz(path: str | Path, model: BodyModel, weights: np.ndarray | Non
 
     Loper et al., SMPL, 2015.
     """
-    mean = np.zeros(1) if model.n_betas else None
+    mean = np.zeros(0)
     rig = make_rig(model, mean, model.n_betas, weights)
     J = len(model.skeleton.parents)
     arrays = {

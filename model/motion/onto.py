@@ -136,7 +136,7 @@ def read_motion(path: str | Path, model: BodyModel, subject: Subject | None = No
 def _onto(path: Path, moving: MovingSkeleton, model: BodyModel, subject: Subject | None, uncertain: str = "",
           gender: str = "neutral") -> BodyMotion:
     """Retarget a motion of another skeleton to a body, by default the mean person's."""
-    subject = subject or model.subject(np.zeros(1) if model.n_betas else None)
+    subject = subject or model.mean_subject
     skeleton = subject.rest_skeleton
     same = copy_motion(skeleton, subject.template, subject.vertices, moving)
     if same is not None:

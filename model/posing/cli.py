@@ -136,11 +136,8 @@ def mesh(model: ModelArg, output: Output, pose: Path | None = None, betas: tuple
     TURNS.check(turns, f"{pose}: turns")
     if (subject is not None) + bool(betas) + own_body > 1:
         raise UsageError("--betas, --subject and --own-body: expected one of them")
-    if not (subject is not None or own_body or loaded.n_betas):
-        raise ValueError(f"{model}: it has no shape components; ask for --own-body")
     # the body: named, the template's own, of given betas, or the mean person
-    person = read_subject(loaded, subject) if subject is not None or own_body else loaded.subject(
-        np.array(betas if betas else (0.0,)))
+    person = read_subject(loaded, subject) if subject is not None or own_body else loaded.subject(np.array(betas))
     vertices = person.vertices(turns)
     body = loaded.template.with_vertices(vertices)
     write_mesh(output, stand_mesh(body, loaded.template, None, ground, front, rotations.exp(turns[0])))

@@ -49,7 +49,7 @@ def bring(path: Path, model: BodyModel, name: str, subject: Subject | None, unit
     """
     # keys, or a motion of another skeleton; without a subject a motion may have betas of its own
     if holds_keys(path):
-        body = subject if subject is not None else model.subject(np.zeros(1) if model.n_betas else None)
+        body = subject if subject is not None else model.mean_subject
         source = read_keys(path, body.skeleton, body.betas, unit, rate)
         judgement = judge_keys(source.poses)
     else:
