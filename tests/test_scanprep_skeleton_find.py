@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
+from hand_bodies import KNUCKLES, bend_fingers, hand
 
 from scanprep.geometry import rotations
 from scanprep.geometry.mesh import Mesh, check_template
@@ -239,3 +240,17 @@ def test_a_template_in_two_pieces_is_refused(figure: Figure, poses: np.ndarray) 
 def test_bad_settings_are_refused_by_name(name: str, value: float) -> None:
     with pytest.raises(ValueError, match=name):
         replace(SkeletonConfig(), **{name: value})
+
+
+def test_fingers_whose_roots_touch_hang_on_the_palm():
+    """Links between neighbouring fingers are dropped, as their joints fit worse than the knuckles."""
+    mesh, rng = hand(), np.random.default_rng(0)
+    poses = np.stack([bend_fingers(mesh, rng.uniform(0, 1.2, 4)) for _ in range(12)])
+    found = find_skeleton(mesh, poses, SkeletonConfig(restarts=1))
+    middles = [mesh.vertices[mesh.faces[found.part_of_face == part]].mean(axis=(0, 1)) for part in range(5)]
+    assert len(found.parents) == 5
+    palm = int(np.argmin([middle[2] for middle in middles]))
+    fingers = [part for part in range(5) if part != palm]
+    assert all(found.parents[part] == palm for part in fingers), found.parents
+    knuckle = np.argmin([[np.linalg.norm(middles[part][:1] - one[:1]) for one in KNUCKLES] for part in fingers], axis=1)
+    assert np.linalg.norm((found.joints[fingers] - KNUCKLES[knuckle])[:, 1:], axis=1).max() < 0.005

@@ -336,4 +336,4 @@ def _joint_between(template: Mesh, label: np.ndarray, a: int, b: int, poses: np.
     if poses is None:
         return ring_centre(template, np.unique(border_between(template, label, a, b)[0]))
     surface = PosedSurface(template, poses)
-    return place_joints(surface, label, surface.core_motions(label), np.array([[a, b]]))[0]
+    return place_joints(surface, label, surface.core_motions(label), np.array([[a, b]]))[0][0]

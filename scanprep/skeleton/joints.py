@@ -148,8 +148,8 @@ def to_tree(search: PartSearch, label: np.ndarray) -> tuple[np.ndarray, np.ndarr
     """Merge parts, and drop links, until parts and links form a tree.
 
     In a loop, the two parts whose union costs least are merged unless they are well separated. The paper did this by
-    hand with the halves of crotch and chest. If all parts of a loop move freely, the link with the largest relative
-    motion is dropped, such as that of thighs that touch. On a symmetric body both sides are treated alike. Returns
+    hand with the halves of crotch and chest. If all parts of a loop move freely, the link whose joint fits worst is
+    dropped, such as that of thighs or fingers that touch. On a symmetric body both sides are treated alike. Returns
     labels (F,), links (P - 1, 2) and the opened loops.
 
     [SCAPE] §3
@@ -168,7 +168,8 @@ def to_tree(search: PartSearch, label: np.ndarray) -> tuple[np.ndarray, np.ndarr
             image = mirror_pairs(links, search.sides.partners(label))
             # merge the cheapest pair if it is not well separated, or if no link can be dropped with its mirror image
             cheapest = number[extra[number].argmin()]
-            sound = [k for k in np.argsort(-extra[number], kind="stable")
+            apart = place_joints(search.surface, label, search.motions(label), links[loop])[1]
+            sound = [k for k in np.argsort(-apart, kind="stable")
                      if is_connected(np.delete(links, [loop[k], image[loop[k]]], axis=0), count)]
             close = separation[cheapest] < LOOP_SEPARATION * search.config.separation
             joined = not sound or close
@@ -225,25 +226,29 @@ def fewer_parts(search: PartSearch, label: np.ndarray, count: int, limit: float 
     return None
 
 
-def place_joints(surface: PosedSurface, label: np.ndarray, motions: Motions, links: np.ndarray) -> np.ndarray:
+def place_joints(surface: PosedSurface, label: np.ndarray, motions: Motions, links: np.ndarray
+                 ) -> tuple[np.ndarray, np.ndarray]:
     """Place joints (n, 3), metres on the template: points that both parts of a link (n, 2) carry to one place.
 
     Least squares over the poses [Articulated]. Along the axis of a hinge, and where the parts hardly rotate, any point
-    fits. There the joint is pulled to the centroid of the border.
+    fits. There the joint is pulled to the centroid of the border. Returned beside them is how far apart the two parts
+    carry each joint (n,), metres, RMS over the poses.
     """
     s = surface
     edge = s.mesh.edges[s.mesh.edge_use == 2]
     middle = s.x[edge].mean(axis=1)
     both = np.sort(label[s.pairs], axis=1)
-    joints = np.empty((len(links), 3))
+    joints, apart = np.empty((len(links), 3)), np.empty(len(links))
     for n, (a, b) in enumerate(links):
         border = (both == [min(a, b), max(a, b)]).all(axis=1)
         # centroid and radius of the border, weighted by edge lengths
         ring = np.average(middle[border], axis=0, weights=s.pair_lengths[border])
         radius = np.sqrt(np.average(((middle[border] - ring)**2).sum(axis=1), weights=s.pair_lengths[border]))
         dR = motions.R[a] - motions.R[b]
-        joints[n] = ring + _meeting_point(dR, motions.t[a] - motions.t[b] + dR @ ring, radius)
-    return joints + s.origin
+        gap = motions.t[a] - motions.t[b] + dR @ ring
+        centre = _meeting_point(dR, gap, radius)
+        joints[n], apart[n] = ring + centre, np.sqrt(((dR @ centre + gap)**2).sum(axis=1).mean())
+    return joints + s.origin, apart
 
 
 def _meeting_point(dR: np.ndarray, gap: np.ndarray, radius: float) -> np.ndarray:
@@ -257,7 +262,7 @@ def _meeting_point(dR: np.ndarray, gap: np.ndarray, radius: float) -> np.ndarray
     expected = 0.6 * radius                      # usual distance of a joint from the border's centroid
     for _ in range(2):
         c = -np.linalg.solve(A + pull * np.eye(3), b)
-        pull = max(least, float(((dR @ c + gap)**2).sum(axis=1).mean()) / expected**2)
+        pull = max(least, float(((dR @ c + gap)**2).sum(axis=1).mean()) / max(expected, 1e-9)**2)
     return c
 
 

@@ -81,7 +81,7 @@ class SkeletonFinder:
             touching = {tuple(pair) for pair in free.contacts(moved).tolist()}
             same = moved.max() == label.max() and touching.issuperset(map(tuple, np.sort(links, axis=1).tolist()))
             label = moved if same else label
-        joints = place_joints(surface, label, surface.core_motions(label), links)   # [Articulated] joints
+        joints, _ = place_joints(surface, label, surface.core_motions(label), links)   # [Articulated] joints
         skeleton = _assemble(self.template, label, links, joints)
         if tied:
             skeleton = replace(skeleton, names=name_parts(self.template, skeleton, self.symmetry))
