@@ -1,7 +1,7 @@
 """Choice of the number of parts by the error of left-out poses."""
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -20,15 +20,43 @@ from .config import LearnConfig
 from .scape import Progress, ProgressShares, learn_pose
 
 QUICK = LearnConfig(prunings=(0.01,), ridges=(1e-3, 1e-2), refinements=1)    # models that are only compared
-MORE, TRIES = 4, 3                   # parts added at each try, and most tries
+MORE, TRIES = 4, 10                  # parts added at each try, and most tries
+GAIN = 0.03                          # more parts must lower the left-out error by so much: they cost time and names
+VAIN = 2                             # tries in a row without such a gain end the search
 
 
 @dataclass(frozen=True, eq=False)
 class ChosenSkeleton:
-    """A skeleton, and the errors of left-out poses, metres, by the number of parts."""
+    """A skeleton, and what it was chosen from.
+
+    Attributes
+    ----------
+    skeleton : Skeleton
+        With as many parts as help to predict left-out poses.
+    errors : dict of int to float, metres
+        Error of left-out poses by the number of parts that were tried, with sides as in the skeleton.
+    tied : bool
+        Whether left and right have the same parts by construction.
+    other_error : float, metres
+        Least error of left-out poses with sides the other way; NaN where they were not tried.
+    """
 
     skeleton: Skeleton
     errors: dict[int, float]
+    tied: bool
+    other_error: float
+
+    @property
+    def error(self) -> float:
+        """Error of left-out poses with the chosen parts, metres."""
+        return self.errors[len(self.skeleton.parents)]
+
+    @property
+    def as_good(self) -> tuple[int, int]:
+        """The fewest and the most parts that predict left-out poses as well, within 3%."""
+        least = min(self.errors.values())
+        level = [parts for parts, error in self.errors.items() if error <= least * (1 + GAIN)]
+        return min(level), max(level)
 
 
 @one_thread()
@@ -39,7 +67,8 @@ def choose_skeleton(template: Mesh, poses: np.ndarray, progress: Progress | None
     The search for rigid parts stops where surfaces no longer meet in a joint. But trunk and shoulders bend without
     joints, and need more parts. So finer skeletons are found from the same restarts, and a model is learned with each
     on a coarse copy of the bodies. They are kept while the error of left-out poses falls, and while a person's parts
-    can be named.
+    can be named. On a body with two sides, skeletons with the same parts left and right compete with free ones; those
+    of a person stay alike.
 
     Parameters
     ----------
@@ -64,56 +93,97 @@ def choose_skeleton(template: Mesh, poses: np.ndarray, progress: Progress | None
     ------
     ValueError
         As `find_skeleton`; a part that is too small for the coarse copies.
+
+    Examples
+    --------
+    >>> from model import load_built_in_model
+    >>> people = load_built_in_model()
+    >>> poses = people.subject(None).vertices(people.pose_examples[:3])
+    >>> choose_skeleton(people.template, poses).skeleton.part_of_face.shape == (len(people.template.faces),)
+    True
     """
-    report_progress = progress or (lambda done, total: None)
     poses = np.asarray(poses, dtype=np.float64)
-    settings = SkeletonConfig()
-    whole = 1 + settings.restarts + TRIES
-    shown = poses if known is None else np.concatenate([poses, known])
-    finder = SkeletonFinder(template, shown, settings, lambda done, total: report_progress(done, whole), step)
-    coarse_vertices = 2500  # of the coarse bodies on which models are compared: a model in seconds
-    vertices, coarse = coarse_copy(template, coarse_vertices)
-
-    def tried(parts: int | None) -> tuple[Skeleton, float] | None:
-        name = "best parts" if parts is None else f"{parts} parts"
-        return step(name, (template, poses, settings, parts, QUICK, coarse_vertices, known),
-                    lambda: _try_parts(finder, parts, coarse, poses[:, vertices],
-                                       None if known is None else known[:, vertices]))
-
-    first = tried(None)
-    assert first is not None, "what goes wrong without a count of parts is raised"
-    best, least = first
-    errors = {len(best.parents): least}
-    for done in range(1, 1 + TRIES):
-        wanted = len(best.parents) + MORE
-        finer = tried(wanted)
-        report_progress(settings.restarts + done, whole)
-        if finer is None or (is_person(best) and not is_person(finer[0])):
-            break                       # the pose prior of people needs the names of parts, which would be lost
-        errors[wanted] = finer[1]
-        # more parts must lower the left-out error by 3%, since they cost time and names
-        if errors[wanted] > (1 - 0.03) * errors[len(best.parents)]:
-            break
-        best = finer[0]
-    report_progress(whole, whole)
-    return ChosenSkeleton(best, errors)
+    search = PartsSearch(template, poses, known, progress or (lambda done, total: None), step)
+    chosen = search.choose(None)
+    # sides that are tied harm a body that stands crooked; the names of a person need them
+    if chosen.tied and not is_person(chosen.skeleton):
+        free = search.choose(False)
+        pair = (free, chosen) if free.error < (1 - GAIN) * chosen.error else (chosen, free)
+        chosen = replace(pair[0], other_error=pair[1].error)
+    search.report_progress(search.whole, search.whole)
+    return chosen
 
 
-def _try_parts(finder: SkeletonFinder, parts: int | None, coarse: Mesh, poses: np.ndarray, known: np.ndarray | None
-               ) -> tuple[Skeleton, float] | None:
-    """Find a skeleton with `parts` parts and its error on coarse bodies (M, n, 3), with those of a prior (K, n, 3).
+class PartsSearch:
+    """The search for the number of parts, by the error of left-out poses of coarse bodies; see `choose_skeleton`."""
 
-    None where there is no tree of so many parts, or parts are too small to compare.
-    """
-    try:
-        skeleton = finder.skeleton(finder.runs[0] if parts is None else finder.first, parts)[0]
-        if parts not in (None, len(skeleton.parents)):
-            return None
-        return skeleton, _leave_out_error(poses, coarse_skeleton(skeleton, finder.template, coarse), coarse, known)
-    except ValueError:
-        if parts is None:
-            raise
-        return None
+    COARSE = 2500                    # vertices of the bodies on which models are compared: a model in seconds
+
+    def __init__(self, template: Mesh, poses: np.ndarray, known: np.ndarray | None, report_progress: Progress,
+                 step: Step) -> None:
+        self.template, self.poses, self.known = template, poses, known
+        self.report_progress, self.step = report_progress, step
+        self.vertices, self.coarse = coarse_copy(template, self.COARSE)
+        self.each = 1 + SkeletonConfig().restarts + TRIES      # skeletons with sides one way
+        self.whole, self.begun = 2 * self.each, 0
+
+    def choose(self, symmetric: bool | None) -> ChosenSkeleton:
+        """Choose the number of parts, with sides alike or free; by default alike where the body is symmetric."""
+        settings = SkeletonConfig(symmetric=symmetric)
+        before, self.begun = self.begun, self.begun + self.each
+        shown = self.poses if self.known is None else np.concatenate([self.poses, self.known])
+        finder = SkeletonFinder(self.template, shown, settings,
+                                lambda done, total: self.report_progress(before + done, self.whole), self.step)
+        first = self._try(finder, settings, None)
+        assert first is not None, "what goes wrong without a count of parts is raised"
+        best, least = first
+        errors, vain = {len(best.parents): least}, 0
+        for done in range(1, 1 + TRIES):
+            wanted = len(best.parents) + MORE * (1 + vain)
+            finer = self._try(finder, settings, wanted)
+            self.report_progress(before + settings.restarts + done, self.whole)
+            # the pose prior of people needs the names of parts, which a finer skeleton may lose
+            usable = finer is not None and (is_person(finer[0]) or not is_person(best))
+            if finer is not None and usable:
+                errors.setdefault(len(finer[0].parents), finer[1])
+            vain += 1
+            if finer is not None and usable and finer[1] <= (1 - GAIN) * least:
+                (best, least), vain = finer, 0
+            if vain == VAIN:
+                break
+        return ChosenSkeleton(best, errors, finder.runs[0].search.sides.tied, np.nan)
+
+    def _try(self, finder: SkeletonFinder, settings: SkeletonConfig, parts: int | None
+             ) -> tuple[Skeleton, float] | None:
+        """Find a skeleton with `parts` parts, or the nearest number, and its error on the coarse bodies.
+
+        None where parts are too small to compare.
+        """
+        def make() -> tuple[Skeleton, float] | None:
+            try:
+                skeleton = finder.skeleton(finder.runs[0] if parts is None else finder.first, parts)[0]
+                return skeleton, self._left_out_error(coarse_skeleton(skeleton, self.template, self.coarse))
+            except ValueError:
+                if parts is None:
+                    raise
+                return None
+
+        name = f"{'' if settings.symmetric is None else 'free, '}{'best' if parts is None else parts} parts"
+        inputs = self.template, self.poses, settings, parts, QUICK, self.COARSE, self.known
+        return self.step(name, inputs, make)
+
+    def _left_out_error(self, skeleton: Skeleton) -> float:
+        """Compute the mean vertex error, metres, of left-out poses of the coarse bodies."""
+        parts, prior = BlendedTemplate(self.coarse, skeleton, rigid_weights(skeleton)), None
+        poses = self.poses[:, self.vertices]
+        if self.known is not None:
+            known = np.concatenate([self.coarse.vertices[None], self.known[:, self.vertices]])
+            prior = learn_pose(parts, known, QUICK, ProgressShares(None))
+            if len(poses) == 1:
+                return prior.design.left_out_error
+        return learn_pose(parts, poses, QUICK, ProgressShares(None), prior=prior).design.left_out_error
+
+
 
 
 def coarse_copy(template: Mesh, count: int) -> tuple[np.ndarray, Mesh]:
@@ -138,13 +208,3 @@ def coarse_skeleton(skeleton: Skeleton, template: Mesh, coarse: Mesh) -> Skeleto
     unplaced = Skeleton(part, skeleton.parents, joints)
     joints[0] = coarse.vertices[unplaced.part_of_vertex(coarse) == 0].mean(axis=0)
     return Skeleton(part, skeleton.parents, joints)
-
-
-def _leave_out_error(poses: np.ndarray, skeleton: Skeleton, coarse: Mesh, known: np.ndarray | None) -> float:
-    """Compute the mean vertex error, metres, of left-out poses (M, n, 3) of the coarse bodies."""
-    parts, prior = BlendedTemplate(coarse, skeleton, rigid_weights(skeleton)), None
-    if known is not None:
-        prior = learn_pose(parts, np.concatenate([coarse.vertices[None], known]), QUICK, ProgressShares(None))
-        if len(poses) == 1:
-            return prior.design.left_out_error
-    return learn_pose(parts, poses, QUICK, ProgressShares(None), prior=prior).design.left_out_error

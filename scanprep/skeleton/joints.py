@@ -15,6 +15,7 @@ from ..geometry.sparse import label_components
 from .motions import Motions, PosedSurface
 from .parts import FADING, PartSearch
 from .sides import mirror_pairs, reductions
+from .tree import Skeleton
 
 LOOP_SEPARATION = 1.5            # in a loop, parts less than this times the separation apart are merged
 
@@ -161,24 +162,17 @@ def to_tree(search: PartSearch, label: np.ndarray) -> tuple[np.ndarray, np.ndarr
         pairs, separation, extra = search.separations(label)
         of_pair = {tuple(pair): i for i, pair in enumerate(pairs.tolist())}
         while len(links) > count - 1:
-            # links in loops: those whose removal keeps the parts connected
-            each = np.arange(len(links))
-            loop = [i for i in each if is_connected(links[each != i], count)]
-            number = np.array([of_pair[tuple(links[i].tolist())] for i in loop])
-            image = mirror_pairs(links, search.sides.partners(label))
+            dropped, loop = worst_links(search, label, links)
             # merge the cheapest pair if it is not well separated, or if no link can be dropped with its mirror image
+            number = np.array([of_pair[tuple(links[i].tolist())] for i in loop])
             cheapest = number[extra[number].argmin()]
-            apart = place_joints(search.surface, label, search.motions(label), links[loop])[1]
-            sound = [k for k in np.argsort(-apart, kind="stable")
-                     if is_connected(np.delete(links, [loop[k], image[loop[k]]], axis=0), count)]
             close = separation[cheapest] < LOOP_SEPARATION * search.config.separation
-            joined = not sound or close
-            at = cheapest if joined else number[sound[0]]
-            both = label == pairs[at, 0], label == pairs[at, 1]
-            loops.append(Loop(both, bool(joined), len(loop)))
-            if joined:
+            joined = dropped is None or close
+            at = pairs[cheapest] if joined or dropped is None else links[dropped[0]]
+            loops.append(Loop((label == at[0], label == at[1]), bool(joined), len(loop)))
+            if joined or dropped is None:
                 break
-            links = np.delete(links, np.unique([loop[sound[0]], image[loop[sound[0]]]]), axis=0)
+            links = np.delete(links, dropped, axis=0)
         else:
             return label, links, loops
         joined = search.join(label, *pairs[cheapest])
@@ -198,14 +192,55 @@ def tree_of(search: PartSearch, label: np.ndarray, links: np.ndarray, count: int
 
 
 def more_parts(search: PartSearch, label: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray] | None:
-    """Cut the part that bends most; the tree may have one part too many if two of them can be merged."""
+    """Cut the part that bends most; the tree may have one part too many if two of them can be merged.
+
+    A cut that gives a tree is preferred; else the loops of one are opened where the joint fits worst.
+    """
     cuts = sorted((search.split(label, p) for p in range(int(label.max()) + 1)), key=lambda cut: -cut[1])
+    looped = []
     for cut, apart in cuts:
         many = int(cut.max()) + 1
         links = without_weak(search, cut)
         if apart > 0 and len(links) == many - 1 and (many <= count or fewer_parts(search, cut, count) is not None):
             return cut, links
+        if apart > 0 and many <= count:
+            looped.append((cut, links))
+    for cut, links in looped:
+        opened = spanning_links(search, cut, links)
+        if opened is not None:
+            return cut, opened
     return None
+
+
+def spanning_links(search: PartSearch, label: np.ndarray, links: np.ndarray) -> np.ndarray | None:
+    """Drop from the links (n, 2) those in loops whose joint fits worst, until a tree is left; None where none is.
+
+    Of a symmetric body a link is dropped with its mirror image.
+    """
+    count = int(label.max()) + 1
+    while len(links) > count - 1:
+        dropped = worst_links(search, label, links)[0]
+        if dropped is None:
+            return None
+        links = np.delete(links, dropped, axis=0)
+    return links
+
+
+def worst_links(search: PartSearch, label: np.ndarray, links: np.ndarray) -> tuple[np.ndarray | None, np.ndarray]:
+    """Find the link in a loop whose joint fits worst, with its mirror image, and all links (n, 2) that lie in loops.
+
+    None stands for the first where none can be dropped with its mirror image without dividing the body.
+    """
+    count, each = int(label.max()) + 1, np.arange(len(links))
+    # links in loops: those whose removal keeps the parts connected
+    loop = np.array([i for i in each if is_connected(links[each != i], count)])
+    image = mirror_pairs(links, search.sides.partners(label))
+    apart = place_joints(search.surface, label, search.motions(label), links[loop])[1]
+    for k in np.argsort(-apart, kind="stable"):
+        both = np.unique([loop[k], image[loop[k]]])
+        if is_connected(np.delete(links, both, axis=0), count):
+            return both, loop
+    return None, loop
 
 
 def fewer_parts(search: PartSearch, label: np.ndarray, count: int, limit: float = np.inf
@@ -249,6 +284,37 @@ def place_joints(surface: PosedSurface, label: np.ndarray, motions: Motions, lin
         centre = _meeting_point(dR, gap, radius)
         joints[n], apart[n] = ring + centre, np.sqrt(((dR @ centre + gap)**2).sum(axis=1).mean())
     return joints + s.origin, apart
+
+
+def joint_gaps(template: Mesh, poses: np.ndarray, skeleton: Skeleton) -> np.ndarray:
+    """Measure how far apart the two parts of each joint carry it, as a share of the radius of their border.
+
+    Parameters
+    ----------
+    template : Mesh
+        N vertices.
+    poses : (M, N, 3) float, metres
+        Bodies in which the parts move.
+    skeleton : Skeleton
+        On the template, J parts.
+
+    Returns
+    -------
+    (J,) float
+        RMS over the poses; 0 for the root, which has no joint.
+    """
+    surface, label = PosedSurface(template, poses), skeleton.part_of_face
+    motions, gaps = surface.core_motions(label), np.zeros(len(skeleton.parents))
+    both = label[surface.pairs]
+    corners = template.edges[template.edge_use == 2]
+    for a, b in enumerate(skeleton.parents[1:], start=1):
+        border = (np.sort(both, axis=1) == [min(a, b), max(a, b)]).all(axis=1)
+        ring = surface.x[corners[border]].mean(axis=1)
+        radius = np.linalg.norm(ring - ring.mean(axis=0), axis=1).mean()
+        place = skeleton.joints[a] - surface.origin
+        apart = (motions.R[a] - motions.R[b]) @ place + motions.t[a] - motions.t[b]
+        gaps[a] = np.sqrt((apart**2).sum(axis=1).mean()) / radius
+    return gaps
 
 
 def _meeting_point(dR: np.ndarray, gap: np.ndarray, radius: float) -> np.ndarray:

@@ -39,7 +39,7 @@ class Sides:
         self.lengths = surface.pair_lengths[own] * (2 if self.tied else 1)          # with the mirrored borders
         self.middle = np.bincount(self.home[surface.pairs[over]].ravel(),           # metres of border on the plane
                                   np.repeat(surface.pair_lengths[over] / 2, 2), len(self.half))
-        self.areas = surface.face_weights[self.half]
+        self.areas, self.surface = surface.face_weights[self.half], surface
 
     def partners(self, label: np.ndarray) -> np.ndarray:
         """Find the partner (P,) of every label (F,): most of its mirrored triangles have it, and vice versa."""
@@ -81,6 +81,13 @@ class Sides:
         out = label[self.half]
         out[here] = labels
         spread = self.spread(out, partner)
+        if self.tied:
+            # the mirror image of a connected label need not be connected, as triangles are not paired one to one
+            region = np.ones(len(label), dtype=bool) if inside is None else inside
+            number = np.cumsum(region) - 1
+            pairs = number[self.surface.pairs[region[self.surface.pairs].all(axis=1)]]
+            of_each = np.hstack([costs, costs[:, partner[P:]]])[region]
+            spread[region] = keep_connected(of_each, pairs, self.surface.face_weights[region], spread[region])
         return spread if inside is None else np.where(inside, spread, label)
 
     def _apart(self, label: np.ndarray, partner: np.ndarray, here: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
