@@ -4,16 +4,17 @@ from __future__ import annotations
 import importlib.metadata
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any, ClassVar, TypeVar
+from typing import Any, ClassVar, Literal, TypeVar
 
 import numpy as np
 from scipy.sparse import csr_array
 
 from scanprep.geometry import storage
 from scanprep.geometry.mesh import Mesh
+from scanprep.geometry.upright import find_up
 from scanprep.skeleton.tree import Skeleton
 
 from .bilinear import ShapedPoints
@@ -22,6 +23,7 @@ from .features import PoseFeatures, restore_features
 from .linear import PointOperator, Subject, check_pose
 
 Progress = Callable[[int, int], None]
+Up = Literal["x", "y", "z"]          # axis of a template that points up
 Model = TypeVar("Model", bound="BodyModel")
 VERSION = 3                          # of model files: 1 and 2 had fewer kinds of features, or no pose examples
 
@@ -222,6 +224,11 @@ class BodyModel(ABC):
         """
         raise ValueError(f"model: the kind '{self.kind}' cannot take the shape of a registered body")
 
+    def with_up(self: Model, up: Up | None) -> Model:
+        """Return the model with this axis of its template up, "x", "y" or "z"; None leaves it as it is."""
+        return self if up is None else replace(                                  # type: ignore[type-var, return-value]
+            self, template=replace(self.template, up="xyz".index(up)))
+
     def save(self, path: str | Path) -> None:
         """Write the model into one `.npz` file with a JSON header."""
         # arrays that every kind of model has; the kind adds its own
@@ -234,7 +241,7 @@ class BodyModel(ABC):
             **self.arrays()}
         header = {"units": {"length": "metre", "angle": "radian", "betas": "standard deviation"},
                   "versions": writer_versions(), "names": list(skeleton.names), "lift": features.lift.kind,
-                  "info": self.info}
+                  "info": self.info, "up": find_up(self.template).up}
         storage.save(path, self.kind, VERSION, arrays, {**header, **self.notes()})
 
     @classmethod
@@ -373,7 +380,7 @@ def restore_parts(header: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -
                         storage.numbers(arrays, "joints", J, 3, kinds="f"), tuple(header["names"]))
     # the template, and whether the parts belong to its triangles
     template = Mesh(storage.numbers(arrays, "vertices", None, 3, kinds="f"),
-                    storage.numbers(arrays, "faces", None, 3, kinds="iu"))
+                    storage.numbers(arrays, "faces", None, 3, kinds="iu"), up=header.get("up"))
     if len(skeleton.part_of_face) != len(template.faces):
         raise ValueError(f"part_of_face: expected one of {len(template.faces)} faces, "
                          f"found {len(skeleton.part_of_face)}")
@@ -385,7 +392,8 @@ def restore_parts(header: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -
     examples = np.zeros((0, J, 3))
     if header["version"] == VERSION or "pose_examples" in arrays:
         examples = storage.numbers(arrays, "pose_examples", None, J, 3) if len(arrays["pose_examples"]) else examples
-    return {"template": template, "skeleton": skeleton, "pose_mean": storage.numbers(arrays, "pose_mean", J, 3),
+    return {"template": find_up(template), "skeleton": skeleton,
+            "pose_mean": storage.numbers(arrays, "pose_mean", J, 3),
             "pose_covariance": storage.numbers(arrays, "pose_covariance", 3 * J, 3 * J), "info": info,
             "pose_examples": examples}
 

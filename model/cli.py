@@ -14,8 +14,9 @@ from scanprep.dataset import RegisteredSet
 from scanprep.geometry.files import read_mesh, read_registered
 from scanprep.geometry.mesh import Mesh
 from scanprep.judgement import Judgement
+from scanprep.pictures.camera import guess_upright
 
-from .body import BodyModel
+from .body import BodyModel, Up
 from .files import load_model
 
 ModelArg = Annotated[Path, Place("MODEL.npz")]
@@ -70,10 +71,11 @@ def about(model: BodyModel) -> list[Metric]:
     rows.append(Metric("shape components", model.n_betas))
     if model.n_betas:
         rows.append(Metric("differences between the people that they explain", 100 * float(model.explained[-1]), "%"))
-    return [*rows, Metric("numbers that a pose is described by", model.n_features, detail=True)]
+    return [*rows, Metric("up", "xyz"[guess_upright(model.template)[0]]),
+            Metric("numbers that a pose is described by", model.n_features, detail=True)]
 
 
-def import_file(model: ModelArg, output: Output) -> Outcome:
+def import_file(model: ModelArg, output: Output, up: Up | None = None) -> Outcome:
     """A body model of the SMPL family's layout (SMPL, SMPL-H, SMPL-X, STAR, `scape model export -o body.npz`) as ours.
 
     Vertices are those of the published formula. A folder of MHR or SOMA-X is read by the library body-models; the table
@@ -84,20 +86,23 @@ def import_file(model: ModelArg, output: Output) -> Outcome:
     Args:
         model: File with v_template, shapedirs, posedirs, J_regressor, weights, kintree_table and f, or a folder.
         output: Model file to write.
+        up: Axis of the model that points up; else that along which it stands on its feet.
     """
     from .body_library import import_any
 
     with bar("learning how joints bend") as progress:
-        imported = import_any(model, progress)
+        imported = import_any(model, progress).with_up(up)
     imported.save(output)
     off, notes = imported.info.get("left_out_error"), imported.info["notes"].split("; ")
+    axis = guess_upright(imported.template)[0]
     return Outcome(output, [
         *([] if off is None else [Metric(LEFT_OUT, MM * float(off), "mm")]),
         *(Metric("note", note) for note in notes if note),
         Metric("vertices", len(imported.template.vertices)), Metric("triangles", len(imported.template.faces)),
         Metric("joints", len(imported.skeleton.parents)), Metric("betas", imported.n_betas),
         Metric("pose columns", len(imported.correctives)), Metric("pose features", imported.features.lift.kind),
-        Metric("height of the template", float(np.ptp(imported.template.vertices, axis=0).max()), "m"),
+        Metric("up", "xyz"[axis]),
+        Metric("height of the template", float(np.ptp(imported.template.vertices[:, axis])), "m"),
         Metric("parts", ", ".join(imported.skeleton.names))], judgement=Judgement())
 
 
@@ -132,7 +137,7 @@ def read_bodies(folder: Path, template: Mesh, unit: Unit | None = None, one_pers
                       (entry.subject == most if one_person else entry.subject not in subjects[:i]))
         vertices = whole.vertices(names)
     else:
-        faces, vertices, names = read_registered(folder, unit)
+        faces, vertices, names, _ = read_registered(folder, unit)
     if not np.array_equal(faces, template.faces):
         order = ", in another order" if len(faces) == len(template.faces) else ""
         raise ValueError(f"{folder}: expected the triangles of {template}; these have {len(faces)} faces and "

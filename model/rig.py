@@ -144,7 +144,7 @@ def make_rig(model: BodyModel, betas: np.ndarray | None = None, shapes: int = 0,
     if shapes and betas is None:
         raise ValueError(f"shapes: the template's own body has none, got {shapes}")
     rest = np.zeros((len(model.skeleton.parents), 3))
-    mesh = model.template.with_vertices(model.vertices(rest, betas))
+    mesh = model.template.with_vertices(model.vertices(rest, betas), model.template.up)
     return Rig(mesh, replace(model.skeleton, joints=model.rest_joints(betas)),
                strongest(model.skin_weights if weights is None else weights),
                np.moveaxis(model.shape_jacobian(rest)[..., :shapes], -1, 0))
@@ -154,7 +154,7 @@ def subject_rig(subject: Subject) -> Rig:
     """Build the rig of a subject, without shapes."""
     skeleton, template = subject.skeleton, subject.template
     rest = subject.vertices(np.zeros(skeleton.joints.shape))
-    return Rig(template.with_vertices(rest), replace(skeleton, joints=subject.joint_regressor @ rest),
+    return Rig(template.with_vertices(rest, template.up), replace(skeleton, joints=subject.joint_regressor @ rest),
                strongest(skin_weights(template, skeleton)), np.zeros((0, *rest.shape)))
 
 

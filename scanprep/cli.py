@@ -66,7 +66,7 @@ def read_poses(folder: Path, template: Path | None, subject: str | None, unit: U
         registered = RegisteredSet.load(folder)
         return registered.template, registered.poses(subject)
     meshes = read_registered(folder, unit)
-    mesh = read_mesh(template, unit) if template else Mesh(meshes.vertices[0], meshes.faces)
+    mesh = read_mesh(template, unit) if template else Mesh(meshes.vertices[0], meshes.faces, up=meshes.up)
     if not np.array_equal(mesh.faces, meshes.faces):
         raise ValueError(f"{template}: expected the triangles of the meshes in {folder}; it has other ones")
     return mesh, meshes.vertices

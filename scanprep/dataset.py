@@ -129,7 +129,10 @@ class RegisteredSet:
         """
         folder = Path(folder)
         info = _read_header(folder)
-        template = read_mesh(folder / "template.ply", unit="m")
+        template, up = read_mesh(folder / "template.ply", unit="m"), info.pop("up", None)
+        if up not in (None, "x", "y", "z"):
+            raise storage.StorageError(f"{folder / 'set.json'}: up: expected x, y or z, found {str(up)[:20]!r}")
+        template = template if up is None else replace(template, up="xyz".index(up))
         if [len(template.vertices), len(template.faces)] != [info.pop("vertices"), info.pop("faces")]:
             raise MeshFileError(f"{folder / 'template.ply'}: found {template}, set.json says otherwise")
         path = folder / "skeleton.json"
@@ -286,7 +289,7 @@ def write_set(folder: Path, template: Mesh, entries: Sequence[SetEntry], info: d
     write_mesh(folder / "template.ply", template)
     _write_rows(folder, entries)
     header = {"kind": KIND, "version": VERSION, "vertices": len(template.vertices), "faces": len(template.faces),
-              **(info or {})}
+              **({} if template.up is None else {"up": "xyz"[template.up]}), **(info or {})}
     storage.write_json(folder / "set.json", header)              # last: a folder with this file is a complete set
 
 

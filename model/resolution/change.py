@@ -70,6 +70,7 @@ def change_resolution(model: BodyModel, template: Mesh, config: ResolutionConfig
     """
     check_template(template)
     _check_same_surface(model.template, template)
+    template = replace(template, up=model.template.up)
     skeleton = transfer_skeleton(model.skeleton, model.template, template)
     rounds = (config or ResolutionConfig()).rounds
     moved = model.resample(template, skeleton, rounds, progress or (lambda done, total: None))

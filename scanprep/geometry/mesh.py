@@ -29,6 +29,8 @@ class Mesh:
     of_file : (M,) int, optional
         The vertex here of each vertex of the file, if its reader merged some; -1 if it was left out. Files with vertex
         numbers refer to those of the mesh file.
+    up : 0, 1 or 2, optional
+        The axis that points up, where it is known. Other vertices may lie, so `with_vertices` asks for it again.
 
     Raises
     ------
@@ -46,8 +48,11 @@ class Mesh:
     faces: np.ndarray
     colors: np.ndarray | None = None
     of_file: np.ndarray | None = None
+    up: int | None = None
 
     def __post_init__(self) -> None:
+        if self.up not in (None, 0, 1, 2):
+            raise ValueError(f"up: expected 0, 1 or 2, got {self.up}")
         vertices = np.array(self.vertices, dtype=np.float64)
         faces = np.array(self.faces, dtype=np.int64)
         if vertices.ndim != 2 or vertices.shape[1] != 3:
@@ -75,9 +80,9 @@ class Mesh:
     def __repr__(self) -> str:
         return f"Mesh({len(self.vertices)} vertices, {len(self.faces)} faces)"
 
-    def with_vertices(self, vertices: np.ndarray) -> Mesh:
-        """Return a mesh with the same triangles and other vertices (N, 3), metres."""
-        return Mesh(vertices, self.faces, self.colors, self.of_file)
+    def with_vertices(self, vertices: np.ndarray, up: int | None = None) -> Mesh:
+        """Return a mesh with the same triangles and other vertices (N, 3), metres; `up` is their axis, where known."""
+        return Mesh(vertices, self.faces, self.colors, self.of_file, up)
 
     @cached_property
     def corners(self) -> np.ndarray:
