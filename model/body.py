@@ -13,6 +13,7 @@ import numpy as np
 from scipy.sparse import csr_array
 
 from scanprep.geometry import storage
+from scanprep.geometry.attached import Attached
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.upright import find_up
 from scanprep.skeleton.tree import Skeleton
@@ -239,6 +240,9 @@ class BodyModel(ABC):
             "joints": skeleton.joints, "feature_part": features.part, "feature_mix": features.mix,
             "pose_mean": self.pose_mean, "pose_covariance": self.pose_covariance, "pose_examples": self.pose_examples,
             **self.arrays()}
+        if (attached := self.template.attached) is not None:
+            arrays |= {"whole_vertices": attached.whole.vertices, "whole_faces": attached.whole.faces.astype(np.int32),
+                       "whole_body": attached.body.astype(np.int32)}
         header = {"units": {"length": "metre", "angle": "radian", "betas": "standard deviation"},
                   "versions": writer_versions(), "names": list(skeleton.names), "lift": features.lift.kind,
                   "info": self.info, "up": find_up(self.template).up}
@@ -381,6 +385,8 @@ def restore_parts(header: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -
     # the template, and whether the parts belong to its triangles
     template = Mesh(storage.numbers(arrays, "vertices", None, 3, kinds="f"),
                     storage.numbers(arrays, "faces", None, 3, kinds="iu"), up=header.get("up"))
+    if "whole_faces" in arrays:
+        template = replace(template, attached=_restore_attached(arrays, template))
     if len(skeleton.part_of_face) != len(template.faces):
         raise ValueError(f"part_of_face: expected one of {len(template.faces)} faces, "
                          f"found {len(skeleton.part_of_face)}")
@@ -396,6 +402,16 @@ def restore_parts(header: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -
             "pose_mean": storage.numbers(arrays, "pose_mean", J, 3),
             "pose_covariance": storage.numbers(arrays, "pose_covariance", 3 * J, 3 * J), "info": info,
             "pose_examples": examples}
+
+
+def _restore_attached(arrays: Mapping[str, np.ndarray], template: Mesh) -> Attached:
+    """Read the whole mesh that the template is the body of; ValueError where they do not belong together."""
+    whole = Mesh(storage.numbers(arrays, "whole_vertices", None, 3, kinds="f"),
+                 storage.numbers(arrays, "whole_faces", None, 3, kinds="iu"))
+    body = storage.numbers(arrays, "whole_body", len(template.vertices), kinds="iu")
+    if len(np.unique(body)) < len(body) or body.min() < 0 or body.max() >= len(whole.vertices):
+        raise ValueError(f"whole_body: expected different vertices of 0..{len(whole.vertices) - 1}")
+    return Attached(whole, body, template)
 
 
 def restore_variances(arrays: Mapping[str, np.ndarray], total: str) -> tuple[np.ndarray, float]:

@@ -11,6 +11,7 @@ from scanprep.cli import MM, Output, Unit
 from scanprep.command_line import dispatch
 from scanprep.console import Metric, Outcome, bar
 from scanprep.dataset import RegisteredSet
+from scanprep.geometry.attached import in_body
 from scanprep.geometry.files import read_mesh, read_registered
 from scanprep.geometry.mesh import Mesh
 from scanprep.judgement import Judgement
@@ -71,6 +72,8 @@ def about(model: BodyModel) -> list[Metric]:
     rows.append(Metric("shape components", model.n_betas))
     if model.n_betas:
         rows.append(Metric("differences between the people that they explain", 100 * float(model.explained[-1]), "%"))
+    if model.template.attached is not None:
+        rows.append(Metric("components", str(model.template.attached)))
     return [*rows, Metric("up", "xyz"[guess_upright(model.template)[0]]),
             Metric("numbers that a pose is described by", model.n_features, detail=True)]
 
@@ -109,10 +112,11 @@ def import_file(model: ModelArg, output: Output, up: Up | None = None) -> Outcom
 def read_body(path: Path, template: Mesh, unit: str | None = None) -> Mesh:
     """Read a mesh in the triangles of a model's template; ValueError for a mesh with other triangles."""
     body = read_mesh(path, unit)
-    if not np.array_equal(body.faces, template.faces):
+    vertices = in_body(template, body.faces, body.vertices)
+    if vertices is None:
         raise ValueError(f"{path}: expected the triangles of the model ({template}), found {body}; register the "
                          "template to it first (scape prep register)")
-    return body
+    return body if vertices is body.vertices else template.with_vertices(vertices)
 
 
 def read_bodies(folder: Path, template: Mesh, unit: Unit | None = None, one_person: bool = False
@@ -138,8 +142,9 @@ def read_bodies(folder: Path, template: Mesh, unit: Unit | None = None, one_pers
         vertices = whole.vertices(names)
     else:
         faces, vertices, names, _ = read_registered(folder, unit)
-    if not np.array_equal(faces, template.faces):
+    bodies = in_body(template, faces, vertices)
+    if bodies is None:
         order = ", in another order" if len(faces) == len(template.faces) else ""
         raise ValueError(f"{folder}: expected the triangles of {template}; these have {len(faces)} faces and "
                          f"{vertices.shape[1]} vertices{order}")
-    return vertices, names
+    return bodies, names

@@ -116,6 +116,20 @@ class Rig:
                        skeleton=replace(self.skeleton, joints=self.skeleton.joints @ R.T + shift), axes=R @ self.axes,
                        correctives=extra)
 
+    def with_attached(self) -> Rig:
+        """Return the rig of the whole mesh, with what is attached to the body; its skeleton keeps the body's parts."""
+        attached, rest = self.mesh.attached, self.mesh.vertices
+        if attached is None:
+            return self
+        whole, extra = attached.mesh(self.mesh), self.correctives
+
+        def changes(shapes: np.ndarray) -> np.ndarray:
+            moved = [attached.follow(rest + shape) - whole.vertices for shape in shapes]
+            return np.stack(moved) if moved else np.zeros((0, *whole.vertices.shape))
+
+        return replace(self, mesh=whole, weights=strongest(attached.spread(self.weights)), shapes=changes(self.shapes),
+                       correctives=extra and replace(extra, shapes=changes(extra.shapes)))
+
     def with_up(self, up: int) -> Rig:
         """Turn the axis `up` to +y; poses and trans turn with `turn_up`."""
         return self.transform(turn_up(up))

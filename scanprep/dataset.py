@@ -177,7 +177,7 @@ class RegisteredSet:
             mesh = self.template.with_vertices(mesh)
         check_same_topology(Path(name), mesh, self.folder / "template.ply", self.template)
         entry = SetEntry(name, subject, pose, sex, f"meshes/{name}.ply")
-        write_mesh(self.folder / entry.file, mesh)
+        write_mesh(self.folder / entry.file, replace(mesh, attached=None))
         rows = {row.name: row for row in read_entries(self.folder)}
         rows[name] = entry                               # replaces an entry of the same name in its place
         _write_rows(self.folder, rows.values())
@@ -286,7 +286,7 @@ class RegisteredSet:
 
 def write_set(folder: Path, template: Mesh, entries: Sequence[SetEntry], info: dict[str, Any] | None = None) -> None:
     """Write everything of a set but its meshes and skeleton."""
-    write_mesh(folder / "template.ply", template)
+    write_mesh(folder / "template.ply", replace(template, attached=None))
     _write_rows(folder, entries)
     header = {"kind": KIND, "version": VERSION, "vertices": len(template.vertices), "faces": len(template.faces),
               **({} if template.up is None else {"up": "xyz"[template.up]}), **(info or {})}

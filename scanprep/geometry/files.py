@@ -190,7 +190,7 @@ def write_mesh(path: str | Path, mesh: Mesh, precision: Precision = "double") ->
     path : str or Path
         `.ply` (binary), `.ply.gz`, `.obj`, `.stl`, `.off` or `.glb`.
     mesh : Mesh
-        The mesh, metres; colours are written where the format has them.
+        The mesh, metres; colours are written where the format has them. What is attached to a body is written with it.
     precision : 'double' or 'single'
         Precision of the coordinates. A 'double' PLY file returns exactly the same numbers. STL and GLB always have
         single precision, a tenth of a micrometre at the size of a person.
@@ -207,6 +207,7 @@ def write_mesh(path: str | Path, mesh: Mesh, precision: Precision = "double") ->
     >>> Path("triangle.obj").exists()
     True
     """
+    mesh = mesh if mesh.attached is None else mesh.attached.mesh(mesh)
     _write(Path(path), Contents(mesh.vertices, mesh.faces, None, mesh.colors, up=mesh.up), precision, _MESHES)
 
 

@@ -3,6 +3,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from scipy.sparse import coo_array, csr_array
@@ -31,6 +32,8 @@ class Mesh:
         numbers refer to those of the mesh file.
     up : 0, 1 or 2, optional
         The axis that points up, where it is known. Other vertices may lie, so `with_vertices` asks for it again.
+    attached : scanprep.geometry.attached.Attached, optional
+        Eyes, teeth and loose vertices that follow this body in every file that is written.
 
     Raises
     ------
@@ -49,6 +52,7 @@ class Mesh:
     colors: np.ndarray | None = None
     of_file: np.ndarray | None = None
     up: int | None = None
+    attached: Any = None
 
     def __post_init__(self) -> None:
         if self.up not in (None, 0, 1, 2):
@@ -82,7 +86,7 @@ class Mesh:
 
     def with_vertices(self, vertices: np.ndarray, up: int | None = None) -> Mesh:
         """Return a mesh with the same triangles and other vertices (N, 3), metres; `up` is their axis, where known."""
-        return Mesh(vertices, self.faces, self.colors, self.of_file, up)
+        return Mesh(vertices, self.faces, self.colors, self.of_file, up, self.attached)
 
     @cached_property
     def corners(self) -> np.ndarray:
@@ -276,9 +280,13 @@ def template_problem(mesh: Mesh) -> str | None:
     if len(flat):
         return f"{number_of(len(flat), 'triangle has', 'triangles have')} no area, the first is face {flat[0]}"
     if not mesh.is_edge_manifold:
-        return "it is not manifold: some edges have more than two triangles or triangles facing opposite ways"
+        half = np.sort(mesh.faces * len(mesh.vertices) + np.roll(mesh.faces, -1, axis=1), axis=None)
+        first = int(half[1:][half[1:] == half[:-1]][0] // len(mesh.vertices))     # such edges have one direction twice
+        return ("it is not manifold: some edges have more than two triangles or triangles facing opposite ways, the "
+                f"first at {_place(mesh.vertices[first])}")
     if not mesh.is_vertex_manifold:
-        return "it is not manifold: at some vertices separate sheets touch"
+        return f"it is not manifold: at some vertices separate sheets touch, the first at " \
+               f"{_place(mesh.vertices[mesh.non_manifold_vertices[0]])}"
     return None
 
 
@@ -287,6 +295,11 @@ def check_template(mesh: Mesh, name: str = "template") -> None:
     problem = template_problem(mesh)
     if problem:
         raise ValueError(f"{name}: not usable as a template, {problem}")
+
+
+def _place(point: np.ndarray) -> str:
+    """Return a point in words, which no numbering of vertices changes."""
+    return "({:.4g}, {:.4g}, {:.4g}) m".format(*point)
 
 
 def _unit(v: np.ndarray) -> np.ndarray:
