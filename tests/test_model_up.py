@@ -11,6 +11,7 @@ from glb_reader import Glb
 from completion.__main__ import main
 from model import load_built_in_model, load_model
 from scanprep import Mesh, RegisteredSet, read_mesh, write_mesh
+from scanprep.geometry.files import read_registered
 from scanprep.geometry.upright import find_up
 from scanprep.pictures.camera import guess_upright, look_around
 from scanprep.skeleton.tree import Skeleton
@@ -125,3 +126,12 @@ def test_what_has_no_legs_has_its_longest_axis_up():
     assert find_up(Mesh([[0, 0, 0], [0, 0, 1], [0, 0, 2]], [[0, 1, 2]])).up == 2
     stick = [[x, y, z] for x in (0, 2) for y, z in ((0, 0), (0.1, 0), (0, 0.1))]
     assert find_up(Mesh(stick, [[0, 1, 2], [3, 4, 5], [0, 3, 1], [0, 3, 2], [1, 4, 2]])).up == 0
+
+
+@pytest.mark.slow
+def test_a_man_in_any_pose_keeps_his_up(real_data):
+    """Each of the poses of SCAPE as the template of all, bent ones too."""
+    poses = read_registered(real_data / "scape_poses", "m")
+    for vertices in poses.vertices:
+        body = Mesh(vertices, poses.faces)
+        assert find_up(body, poses.vertices).up == guess_upright(body)[0]

@@ -50,8 +50,8 @@ def find_up(body: Mesh, poses: np.ndarray | None = None) -> Mesh:
         standing = body.with_vertices((chosen @ np.swapaxes(R, 1, 2) + t[:, None]).mean(axis=0))
     firm = np.array([support(standing, up) for up in range(3)])
     usual, best = tallest(body.vertices), int(firm.argmax())
-    # along its height a body stands by habit: another axis has to be clear, with a fifth of the outline and twice that
-    clear = firm[best] > 0.2 and firm[best] > 2 * firm[usual]
+    # another axis than the usual one has to be clear: with a fifth of the outline, and twice what stands along that one
+    clear = firm[best] > 0.2 and firm[best] > 2 * max(firm[usual], support(body, usual))
     return replace(body, up=best if clear else usual)
 
 
