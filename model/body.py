@@ -4,16 +4,18 @@ from __future__ import annotations
 import importlib.metadata
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any, ClassVar, TypeVar
+from typing import Any, ClassVar, Literal, TypeVar
 
 import numpy as np
 from scipy.sparse import csr_array
 
 from scanprep.geometry import storage
+from scanprep.geometry.attached import Attached
 from scanprep.geometry.mesh import Mesh
+from scanprep.geometry.upright import find_up
 from scanprep.skeleton.tree import Skeleton
 
 from .bilinear import ShapedPoints
@@ -22,6 +24,7 @@ from .features import PoseFeatures, restore_features
 from .linear import PointOperator, Subject, check_pose
 
 Progress = Callable[[int, int], None]
+Up = Literal["x", "y", "z"]          # axis of a template that points up
 Model = TypeVar("Model", bound="BodyModel")
 VERSION = 3                          # of model files: 1 and 2 had fewer kinds of features, or no pose examples
 
@@ -222,6 +225,11 @@ class BodyModel(ABC):
         """
         raise ValueError(f"model: the kind '{self.kind}' cannot take the shape of a registered body")
 
+    def with_up(self: Model, up: Up | None) -> Model:
+        """Return the model with this axis of its template up, "x", "y" or "z"; None leaves it as it is."""
+        return self if up is None else replace(                                  # type: ignore[type-var, return-value]
+            self, template=replace(self.template, up="xyz".index(up)))
+
     def save(self, path: str | Path) -> None:
         """Write the model into one `.npz` file with a JSON header."""
         # arrays that every kind of model has; the kind adds its own
@@ -232,9 +240,12 @@ class BodyModel(ABC):
             "joints": skeleton.joints, "feature_part": features.part, "feature_mix": features.mix,
             "pose_mean": self.pose_mean, "pose_covariance": self.pose_covariance, "pose_examples": self.pose_examples,
             **self.arrays()}
+        if (attached := self.template.attached) is not None:
+            arrays |= {"whole_vertices": attached.whole.vertices, "whole_faces": attached.whole.faces.astype(np.int32),
+                       "whole_body": attached.body.astype(np.int32)}
         header = {"units": {"length": "metre", "angle": "radian", "betas": "standard deviation"},
                   "versions": writer_versions(), "names": list(skeleton.names), "lift": features.lift.kind,
-                  "info": self.info}
+                  "info": self.info, "up": find_up(self.template).up}
         storage.save(path, self.kind, VERSION, arrays, {**header, **self.notes()})
 
     @classmethod
@@ -373,7 +384,9 @@ def restore_parts(header: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -
                         storage.numbers(arrays, "joints", J, 3, kinds="f"), tuple(header["names"]))
     # the template, and whether the parts belong to its triangles
     template = Mesh(storage.numbers(arrays, "vertices", None, 3, kinds="f"),
-                    storage.numbers(arrays, "faces", None, 3, kinds="iu"))
+                    storage.numbers(arrays, "faces", None, 3, kinds="iu"), up=header.get("up"))
+    if "whole_faces" in arrays:
+        template = replace(template, attached=_restore_attached(arrays, template))
     if len(skeleton.part_of_face) != len(template.faces):
         raise ValueError(f"part_of_face: expected one of {len(template.faces)} faces, "
                          f"found {len(skeleton.part_of_face)}")
@@ -385,9 +398,20 @@ def restore_parts(header: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -
     examples = np.zeros((0, J, 3))
     if header["version"] == VERSION or "pose_examples" in arrays:
         examples = storage.numbers(arrays, "pose_examples", None, J, 3) if len(arrays["pose_examples"]) else examples
-    return {"template": template, "skeleton": skeleton, "pose_mean": storage.numbers(arrays, "pose_mean", J, 3),
+    return {"template": find_up(template), "skeleton": skeleton,
+            "pose_mean": storage.numbers(arrays, "pose_mean", J, 3),
             "pose_covariance": storage.numbers(arrays, "pose_covariance", 3 * J, 3 * J), "info": info,
             "pose_examples": examples}
+
+
+def _restore_attached(arrays: Mapping[str, np.ndarray], template: Mesh) -> Attached:
+    """Read the whole mesh that the template is the body of; ValueError where they do not belong together."""
+    whole = Mesh(storage.numbers(arrays, "whole_vertices", None, 3, kinds="f"),
+                 storage.numbers(arrays, "whole_faces", None, 3, kinds="iu"))
+    body = storage.numbers(arrays, "whole_body", len(template.vertices), kinds="iu")
+    if len(np.unique(body)) < len(body) or body.min() < 0 or body.max() >= len(whole.vertices):
+        raise ValueError(f"whole_body: expected different vertices of 0..{len(whole.vertices) - 1}")
+    return Attached(whole, body, template)
 
 
 def restore_variances(arrays: Mapping[str, np.ndarray], total: str) -> tuple[np.ndarray, float]:

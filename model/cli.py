@@ -11,11 +11,13 @@ from scanprep.cli import MM, Output, Unit
 from scanprep.command_line import dispatch
 from scanprep.console import Metric, Outcome, bar
 from scanprep.dataset import RegisteredSet
+from scanprep.geometry.attached import in_body
 from scanprep.geometry.files import read_mesh, read_registered
 from scanprep.geometry.mesh import Mesh
 from scanprep.judgement import Judgement
+from scanprep.pictures.camera import guess_upright
 
-from .body import BodyModel
+from .body import BodyModel, Up
 from .files import load_model
 
 ModelArg = Annotated[Path, Place("MODEL.npz")]
@@ -70,10 +72,13 @@ def about(model: BodyModel) -> list[Metric]:
     rows.append(Metric("shape components", model.n_betas))
     if model.n_betas:
         rows.append(Metric("differences between the people that they explain", 100 * float(model.explained[-1]), "%"))
-    return [*rows, Metric("numbers that a pose is described by", model.n_features, detail=True)]
+    if model.template.attached is not None:
+        rows.append(Metric("components", str(model.template.attached)))
+    return [*rows, Metric("up", "xyz"[guess_upright(model.template)[0]]),
+            Metric("numbers that a pose is described by", model.n_features, detail=True)]
 
 
-def import_file(model: ModelArg, output: Output) -> Outcome:
+def import_file(model: ModelArg, output: Output, up: Up | None = None) -> Outcome:
     """A body model of the SMPL family's layout (SMPL, SMPL-H, SMPL-X, STAR, `scape model export -o body.npz`) as ours.
 
     Vertices are those of the published formula. A folder of MHR or SOMA-X is read by the library body-models; the table
@@ -84,30 +89,34 @@ def import_file(model: ModelArg, output: Output) -> Outcome:
     Args:
         model: File with v_template, shapedirs, posedirs, J_regressor, weights, kintree_table and f, or a folder.
         output: Model file to write.
+        up: Axis of the model that points up; else that along which it stands on its feet.
     """
     from .body_library import import_any
 
     with bar("learning how joints bend") as progress:
-        imported = import_any(model, progress)
+        imported = import_any(model, progress).with_up(up)
     imported.save(output)
     off, notes = imported.info.get("left_out_error"), imported.info["notes"].split("; ")
+    axis = guess_upright(imported.template)[0]
     return Outcome(output, [
         *([] if off is None else [Metric(LEFT_OUT, MM * float(off), "mm")]),
         *(Metric("note", note) for note in notes if note),
         Metric("vertices", len(imported.template.vertices)), Metric("triangles", len(imported.template.faces)),
         Metric("joints", len(imported.skeleton.parents)), Metric("betas", imported.n_betas),
         Metric("pose columns", len(imported.correctives)), Metric("pose features", imported.features.lift.kind),
-        Metric("height of the template", float(np.ptp(imported.template.vertices, axis=0).max()), "m"),
+        Metric("up", "xyz"[axis]),
+        Metric("height of the template", float(np.ptp(imported.template.vertices[:, axis])), "m"),
         Metric("parts", ", ".join(imported.skeleton.names))], judgement=Judgement())
 
 
 def read_body(path: Path, template: Mesh, unit: str | None = None) -> Mesh:
     """Read a mesh in the triangles of a model's template; ValueError for a mesh with other triangles."""
     body = read_mesh(path, unit)
-    if not np.array_equal(body.faces, template.faces):
+    vertices = in_body(template, body.faces, body.vertices)
+    if vertices is None:
         raise ValueError(f"{path}: expected the triangles of the model ({template}), found {body}; register the "
                          "template to it first (scape prep register)")
-    return body
+    return body if vertices is body.vertices else template.with_vertices(vertices)
 
 
 def read_bodies(folder: Path, template: Mesh, unit: Unit | None = None, one_person: bool = False
@@ -132,9 +141,10 @@ def read_bodies(folder: Path, template: Mesh, unit: Unit | None = None, one_pers
                       (entry.subject == most if one_person else entry.subject not in subjects[:i]))
         vertices = whole.vertices(names)
     else:
-        faces, vertices, names = read_registered(folder, unit)
-    if not np.array_equal(faces, template.faces):
+        faces, vertices, names, _ = read_registered(folder, unit)
+    bodies = in_body(template, faces, vertices)
+    if bodies is None:
         order = ", in another order" if len(faces) == len(template.faces) else ""
         raise ValueError(f"{folder}: expected the triangles of {template}; these have {len(faces)} faces and "
                          f"{vertices.shape[1]} vertices{order}")
-    return vertices, names
+    return bodies, names

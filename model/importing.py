@@ -17,6 +17,7 @@ from scipy.sparse import coo_array, csc_array, csr_array
 
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.storage import ObjectsError, StorageError, check_regular, load_arrays, names_in, taking_apart
+from scanprep.geometry.upright import find_up
 from scanprep.skeleton.names import name_parts
 from scanprep.skeleton.symmetry import find_symmetry
 from scanprep.skeleton.tree import Skeleton
@@ -100,7 +101,7 @@ def import_model(path: str | Path) -> SkinningModel:
 
 def as_skinning(published: Published, info: dict[str, Any]) -> SkinningModel:
     """Build the skinning model of published arrays."""
-    mesh, K, C = published.mesh, published.shapes.shape[2], published.bends.shape[2]
+    mesh, K, C = find_up(published.mesh), published.shapes.shape[2], published.bends.shape[2]
     skeleton = _skeleton(published)
     J, shapes, bends = len(published.parents), np.moveaxis(published.shapes, -1, 0), np.moveaxis(published.bends, -1, 0)
     joint_components = np.stack([published.regressor @ each for each in shapes]) if K else np.zeros((0, J, 3))

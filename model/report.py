@@ -41,7 +41,8 @@ def component_panes(model: BodyModel, count: int = 4, deviations: float = 2.0) -
     for k in range(count):
         for sign in (-1, 1):
             wanted.append((f"{k + 1}: {sign * deviations:+.0f} sd", sign * deviations * np.eye(count)[k]))
-    bodies = [model.template.with_vertices(model.vertices(np.zeros((J, 3)), betas, np.zeros(3)))
+    up = model.template.up
+    bodies = [model.template.with_vertices(model.vertices(np.zeros((J, 3)), betas, np.zeros(3)), up)
               for _, betas in wanted]
     camera = look_around(bodies[0], np.stack([b.vertices for b in bodies]))[0]
     return [Pane([body], camera, name) for body, (name, _) in zip(bodies, wanted, strict=True)]
@@ -60,7 +61,7 @@ def picture_character(model: BodyModel, count: int = 4, height: int = 420) -> np
     """
     skeleton, betas = model.skeleton, np.zeros(1)
     rest = np.zeros((len(skeleton.parents), 3))
-    body = model.template.with_vertices(model.vertices(rest, betas))
+    body = model.template.with_vertices(model.vertices(rest, betas), model.template.up)
     joints = model.joint_regressor @ body.vertices
     # training poses from the most bent on; the more bent half is shown, evenly spread
     examples = model.pose_examples[np.argsort(-np.abs(model.pose_examples[:, 1:]).sum(axis=(1, 2)), kind="stable")]

@@ -116,6 +116,20 @@ class Rig:
                        skeleton=replace(self.skeleton, joints=self.skeleton.joints @ R.T + shift), axes=R @ self.axes,
                        correctives=extra)
 
+    def with_attached(self) -> Rig:
+        """Return the rig of the whole mesh, with what is attached to the body; its skeleton keeps the body's parts."""
+        attached, rest = self.mesh.attached, self.mesh.vertices
+        if attached is None:
+            return self
+        whole, extra = attached.mesh(self.mesh), self.correctives
+
+        def changes(shapes: np.ndarray) -> np.ndarray:
+            moved = [attached.follow(rest + shape) - whole.vertices for shape in shapes]
+            return np.stack(moved) if moved else np.zeros((0, *whole.vertices.shape))
+
+        return replace(self, mesh=whole, weights=strongest(attached.spread(self.weights)), shapes=changes(self.shapes),
+                       correctives=extra and replace(extra, shapes=changes(extra.shapes)))
+
     def with_up(self, up: int) -> Rig:
         """Turn the axis `up` to +y; poses and trans turn with `turn_up`."""
         return self.transform(turn_up(up))
@@ -144,7 +158,7 @@ def make_rig(model: BodyModel, betas: np.ndarray | None = None, shapes: int = 0,
     if shapes and betas is None:
         raise ValueError(f"shapes: the template's own body has none, got {shapes}")
     rest = np.zeros((len(model.skeleton.parents), 3))
-    mesh = model.template.with_vertices(model.vertices(rest, betas))
+    mesh = model.template.with_vertices(model.vertices(rest, betas), model.template.up)
     return Rig(mesh, replace(model.skeleton, joints=model.rest_joints(betas)),
                strongest(model.skin_weights if weights is None else weights),
                np.moveaxis(model.shape_jacobian(rest)[..., :shapes], -1, 0))
@@ -154,7 +168,7 @@ def subject_rig(subject: Subject) -> Rig:
     """Build the rig of a subject, without shapes."""
     skeleton, template = subject.skeleton, subject.template
     rest = subject.vertices(np.zeros(skeleton.joints.shape))
-    return Rig(template.with_vertices(rest), replace(skeleton, joints=subject.joint_regressor @ rest),
+    return Rig(template.with_vertices(rest, template.up), replace(skeleton, joints=subject.joint_regressor @ rest),
                strongest(skin_weights(template, skeleton)), np.zeros((0, *rest.shape)))
 
 

@@ -9,6 +9,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from scanprep.geometry import rotations, storage
+from scanprep.geometry.carrier import SurfaceCarrier, mount
 from scanprep.geometry.mesh import Mesh
 from scanprep.skeleton.tree import Skeleton
 
@@ -22,7 +23,7 @@ from .linear import Subject, check_pose, combination_weights
 from .pose_space import PoseSpace, faces_of_part
 from .priors import sample_poses
 from .products import Terms
-from .resolution.transfer import Piece, SurfaceCarrier, gradients_of, mount
+from .resolution.transfer import Piece, gradients_of
 from .shape_space import ShapeSpace
 from .stitching import StitchingSystem
 

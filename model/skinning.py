@@ -11,6 +11,7 @@ from scipy.sparse import coo_array, csr_array
 from scipy.spatial import cKDTree
 
 from scanprep.geometry import storage
+from scanprep.geometry.carrier import mount
 from scanprep.geometry.mesh import Mesh
 from scanprep.skeleton.tree import Skeleton, affine_weights
 
@@ -19,7 +20,6 @@ from .body import BodyModel, Progress, restore_variances
 from .features import PoseFeatures, RotationLift
 from .linear import Subject, combination_weights
 from .products import Products, Terms
-from .resolution.transfer import mount
 
 
 @dataclass(frozen=True, eq=False, repr=False)

@@ -57,8 +57,12 @@ def group(argv: list[str]) -> int:
 
 
 def read_poses(folder: Path, template: Path | None, subject: str | None, unit: Unit | None) -> tuple[Mesh, np.ndarray]:
-    """Read template and vertices (M, N, 3) of one person from a registered set or a folder of meshes."""
+    """Read template and vertices (M, N, 3) of one person from a registered set or a folder of meshes.
+
+    Of meshes with several components the largest is read, and the others are attached to the template.
+    """
     from .dataset import RegisteredSet
+    from .geometry.attached import take_body
     from .geometry.files import read_mesh, read_registered
     from .geometry.mesh import Mesh
 
@@ -66,10 +70,11 @@ def read_poses(folder: Path, template: Path | None, subject: str | None, unit: U
         registered = RegisteredSet.load(folder)
         return registered.template, registered.poses(subject)
     meshes = read_registered(folder, unit)
-    mesh = read_mesh(template, unit) if template else Mesh(meshes.vertices[0], meshes.faces)
+    mesh = read_mesh(template, unit) if template else Mesh(meshes.vertices[0], meshes.faces, up=meshes.up)
     if not np.array_equal(mesh.faces, meshes.faces):
         raise ValueError(f"{template}: expected the triangles of the meshes in {folder}; it has other ones")
-    return mesh, meshes.vertices
+    body = take_body(mesh)
+    return body, meshes.vertices if body.attached is None else meshes.vertices[:, body.attached.body]
 
 
 def about_mesh(mesh: Mesh) -> list[Metric]:

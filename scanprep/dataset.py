@@ -129,7 +129,10 @@ class RegisteredSet:
         """
         folder = Path(folder)
         info = _read_header(folder)
-        template = read_mesh(folder / "template.ply", unit="m")
+        template, up = read_mesh(folder / "template.ply", unit="m"), info.pop("up", None)
+        if up not in (None, "x", "y", "z"):
+            raise storage.StorageError(f"{folder / 'set.json'}: up: expected x, y or z, found {str(up)[:20]!r}")
+        template = template if up is None else replace(template, up="xyz".index(up))
         if [len(template.vertices), len(template.faces)] != [info.pop("vertices"), info.pop("faces")]:
             raise MeshFileError(f"{folder / 'template.ply'}: found {template}, set.json says otherwise")
         path = folder / "skeleton.json"
@@ -174,7 +177,7 @@ class RegisteredSet:
             mesh = self.template.with_vertices(mesh)
         check_same_topology(Path(name), mesh, self.folder / "template.ply", self.template)
         entry = SetEntry(name, subject, pose, sex, f"meshes/{name}.ply")
-        write_mesh(self.folder / entry.file, mesh)
+        write_mesh(self.folder / entry.file, replace(mesh, attached=None))
         rows = {row.name: row for row in read_entries(self.folder)}
         rows[name] = entry                               # replaces an entry of the same name in its place
         _write_rows(self.folder, rows.values())
@@ -283,10 +286,10 @@ class RegisteredSet:
 
 def write_set(folder: Path, template: Mesh, entries: Sequence[SetEntry], info: dict[str, Any] | None = None) -> None:
     """Write everything of a set but its meshes and skeleton."""
-    write_mesh(folder / "template.ply", template)
+    write_mesh(folder / "template.ply", replace(template, attached=None))
     _write_rows(folder, entries)
     header = {"kind": KIND, "version": VERSION, "vertices": len(template.vertices), "faces": len(template.faces),
-              **(info or {})}
+              **({} if template.up is None else {"up": "xyz"[template.up]}), **(info or {})}
     storage.write_json(folder / "set.json", header)              # last: a folder with this file is a complete set
 
 

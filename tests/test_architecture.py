@@ -35,9 +35,9 @@ ROOMS = {
         "pipeline": "batch cleaning correspondence geometry pictures registration skeleton synthetic viewer"},
     "model": {
         "fitting": "", "motion": "", "resolution": "",
-        "export": "motion", "posing": "export fitting motion resolution", "measurement": "posing",
+        "export": "motion", "posing": "export fitting motion", "measurement": "posing",
         "learning": "fitting posing resolution",
-        "coregistration": "fitting learning resolution", "statue": "export fitting motion",
+        "coregistration": "fitting learning", "statue": "export fitting motion",
         "evaluation": "fitting posing"},
     "completion": {
         "mocap": "", "partial": "mocap", "demo": "mocap partial", "tracking": "mocap partial",

@@ -10,11 +10,12 @@ from model.cli import group
 from model.features import linear_features
 from model.pose_space import PoseSpace
 from model.resolution.change import ResolutionConfig, change_resolution, resample, resolution_gap, subdivide_at_middles
-from model.resolution.transfer import Piece, gradients_of, mount, transfer_skeleton
+from model.resolution.transfer import Piece, gradients_of, transfer_skeleton
 from model.scape import BlendScapeModel, ScapeModel
 from model.shape_space import ShapeSpace
 from scanprep import decimate, write_mesh
 from scanprep.geometry import rotations
+from scanprep.geometry.carrier import mount
 from scanprep.geometry.mesh import Mesh
 
 ROUGH = ResolutionConfig(rounds=0)

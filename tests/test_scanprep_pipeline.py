@@ -12,12 +12,12 @@ from scan_folders import MARKS, QUICK, ball, contents, write_scans
 from scipy.spatial.transform import Rotation
 
 from model.coregistration.lead import ModelLead
-from model.resolution.transfer import mount
 from scanprep import Mesh, RegisteredSet, read_mesh, write_mesh
 from scanprep.batch.ownership import HOME, ForeignFileError
 from scanprep.batch.pool import Workers
 from scanprep.cleaning.clean_scan import CleanScanConfig
 from scanprep.correspondence.correspondences import Correspondences
+from scanprep.geometry.carrier import mount
 from scanprep.pipeline import prepare as preparing
 from scanprep.pipeline import scan as one_scan
 from scanprep.pipeline.prepare import prepare

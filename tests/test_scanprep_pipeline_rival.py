@@ -8,9 +8,9 @@ import pytest
 from scan_folders import WITH_PICTURES, ball, contents
 
 from model.coregistration.lead import ModelLead
-from model.resolution.transfer import mount
 from scanprep import Mesh, RegisteredSet, read_mesh, write_mesh
 from scanprep.batch.opening import workspace
+from scanprep.geometry.carrier import mount
 from scanprep.pipeline import bootstrap
 from scanprep.pipeline import prepare as preparing
 from scanprep.pipeline import scan as one_scan

@@ -10,8 +10,8 @@ from model.body import BodyModel
 from model.features import linear_features
 from model.linear import combination_weights
 from model.products import ShapedProducts, Terms
-from model.resolution.transfer import mount
 from scanprep.geometry import storage
+from scanprep.geometry.carrier import mount
 from scanprep.geometry.mesh import Mesh
 from scanprep.skeleton.tree import Skeleton
 

@@ -26,6 +26,7 @@ from model.people import person_judgement
 from model.priors import CRUDE
 from scanprep.depth_camera.picture import DepthPicture
 from scanprep.geometry import storage
+from scanprep.geometry.attached import take_body
 from scanprep.geometry.files import check_same_topology, read_mesh, write_mesh
 from scanprep.geometry.geodesics import SurfaceGraph
 from scanprep.geometry.mesh import Mesh
@@ -505,7 +506,9 @@ def load_completion(folder: str | Path) -> Completion:
     path = folder / "completion.npz"
     header, arrays = storage.load(path, KIND, tuple(range(1, VERSION + 1)))
     with storage.taking_apart(path, "a whole completion"):
-        completed, predicted = (read_mesh(folder / f"{name}.ply", unit="m") for name in ("completed", "predicted"))
+        # without the eyes that the model has attached to its body
+        completed, predicted = (take_body(read_mesh(folder / f"{name}.ply", unit="m"))
+                                for name in ("completed", "predicted"))
         check_same_topology(folder / "predicted.ply", predicted, folder / "completed.ply", completed)
         # arrays with their expected shapes; betas and errors may be missing, the others may not
         N = len(completed.vertices)

@@ -144,7 +144,8 @@ def of_model(name: str, model: BodyModel) -> Content:
 
 def of_subject(name: str, subject: Subject) -> Content:
     """Show a body of fixed shape at rest."""
-    body = subject.template.with_vertices(subject.vertices(np.zeros((len(subject.skeleton.parents), 3))))
+    body = subject.template.with_vertices(subject.vertices(np.zeros((len(subject.skeleton.parents), 3))),
+                                          subject.template.up)
     return Content(name, [body_shades(body, subject.skeleton.part_of_face)], Stance.of(body), sizes(body))
 
 

@@ -31,7 +31,8 @@ def of_motion(name: str, motion: Motion, subject: Subject, markers: MarkerSequen
     body = subject.template.with_vertices(frames[0].astype(float))
     shapes = [Moving(body_shades(body, subject.skeleton.part_of_face, name="body"), frames[:1], motion.rate,
                      (basis, coefficients))]
-    at_rest = subject.template.with_vertices(subject.vertices(np.zeros((len(subject.skeleton.parents), 3))))
+    at_rest = subject.template.with_vertices(subject.vertices(np.zeros((len(subject.skeleton.parents), 3))),
+                                             subject.template.up)
     stance = Stance.of(at_rest, motion.poses).around(frames[:, ::7])
     content = Content(name, shapes, stance, lasting(motion.poses, motion.rate), stance.around(frames[0]))
     return content if markers is None else with_markers(content, motion, markers)

@@ -15,6 +15,7 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial import cKDTree
 
+from scanprep.geometry.carrier import SurfaceCarrier, mount
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.surface import Surface
 from scanprep.judgement import WrongScaleError, extent, unit_problem
@@ -35,7 +36,6 @@ from ..fitting.search import Landmarks, ModelMismatchError, find_bodies, lay_mod
 from ..fitting.settings import ScanFitConfig
 from ..learning.config import LearnConfig
 from ..learning.scape import learn_scape
-from ..resolution.transfer import SurfaceCarrier, mount
 
 # the first model of a set only has to find bodies: these settings take a tenth of the time of `scape learn`
 LEARNING = LearnConfig(prunings=(0.01,), ridges=(0.003, 0.03), refinements=1)

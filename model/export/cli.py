@@ -5,7 +5,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Literal, NamedTuple
+from typing import Annotated, NamedTuple
 
 import numpy as np
 
@@ -19,7 +19,7 @@ from scanprep.judgement import Judgement
 from scanprep.pictures.camera import guess_upright
 from scanprep.ranges import Beta, Positive
 
-from ..body import BodyModel
+from ..body import BodyModel, Up
 from ..cli import ModelArg
 from ..files import load_model
 from ..linear import Subject
@@ -38,7 +38,7 @@ MEASURED = 40                        # poses or frames in which the files are co
 
 def export(model: ModelArg, output: Output, betas: tuple[Beta, ...] = (), own_body: bool = False,
            motion: Path | None = None, shapes: Annotated[int | None, Called("--morphs")] = None,
-           correctives: int | None = None, unit: Unit | None = None, up: Literal["x", "y", "z"] | None = None,
+           correctives: int | None = None, unit: Unit | None = None, up: Up | None = None,
            root: str | None = None, names: Names | None = None, ground: bool = False, front: bool = False,
            fps: Positive | None = None, rate: Positive | None = None) -> Outcome:
     """Write a model for other programs; what is written follows from the name of the output.
@@ -64,7 +64,7 @@ def export(model: ModelArg, output: Output, betas: tuple[Beta, ...] = (), own_bo
         correctives: Further morph targets by which the motion comes nearer to the exact one; as many as bring it within
             half a millimetre, at most 48; 0 for plain skinning.
         unit: Of the lengths in a BVH file; cm.
-        up: Axis of the model that points up, which GLB and BVH turn to y; else that of the largest extent.
+        up: Axis of the model that points up, which GLB and BVH turn to y; else as the model says.
         root: Part that the skeleton hangs on, as pelvis.
         names: Whose names the bones of a person have: mixamo, unity, unreal, vrm, h-anim or opensim.
         ground: Soles on height 0, of the body and of the lowest frame.
@@ -85,7 +85,7 @@ def export(model: ModelArg, output: Output, betas: tuple[Beta, ...] = (), own_bo
         hint = "; name a folder for the meshes of a motion" if (writer.kind, wrong[0]) == ("mesh", "motion") else ""
         raise UsageError(f"--{wrong[0].replace('_', '-')}: it says nothing about a {writer.kind}{hint}")
     # the motion, and the betas of the body that is asked for; None is the template's own
-    loaded = load_model(model)
+    loaded = load_model(model).with_up(up)
     chosen = loaded.subject(np.array(betas) if betas else None) if betas or own_body else None
     moves = None if motion is None else read_motion(motion, loaded, chosen, rate=rate)
     if moves is not None and fps is not None:
@@ -94,7 +94,7 @@ def export(model: ModelArg, output: Output, betas: tuple[Beta, ...] = (), own_bo
         raise UsageError("--own-body: the template's own body has no betas")
     person = np.array(betas) if betas else None if own_body else moves.betas if moves is not None else np.zeros(0)
     order = Order(output, model, loaded, person, moves, shapes, correctives, unit or "cm",
-                  None if up is None else "xyz".index(up), root, names, ground, front)
+                  root, names, ground, front)
     judgement = Judgement.of(check=moves.doubts if moves is not None else ())
     return Outcome(output, writer.write(order),
                    judgement=judgement.merge(person_judgement(loaded, np.array(betas), ASKED)) if betas else judgement)
@@ -112,7 +112,6 @@ class Order:
     shapes: int | None
     correctives: int | None
     unit: str                        # of a BVH file
-    up: int | None                   # axis
     root: str | None
     names: Names | None
     ground: bool
@@ -142,8 +141,8 @@ def _mesh(order: Order) -> list[Metric]:
     """Write the mesh of the body at rest."""
     model = order.model
     rest = np.zeros((len(model.skeleton.parents), 3))
-    body = model.template.with_vertices(model.vertices(rest, order.person))
-    write_mesh(order.output, stand_mesh(body, body, order.up, order.ground, order.front))
+    body = model.template.with_vertices(model.vertices(rest, order.person), model.template.up)
+    write_mesh(order.output, stand_mesh(body, body, order.ground, order.front))
     return [Metric("vertices", len(body.vertices)), _size(order.output)]
 
 
@@ -222,7 +221,7 @@ def _poses_to_measure(order: Order) -> tuple[Metric, np.ndarray, np.ndarray]:
 
 def _write_rig(order: Order, rig: Rig, write: Callable[..., None]) -> list[Metric]:
     """Write a rig and its motion in the conventions of other programs; return figures of the skeleton."""
-    axis = guess_upright(rig.mesh)[0] if order.up is None else order.up
+    axis = guess_upright(rig.mesh)[0]
     rest = np.zeros((0, len(rig.skeleton.parents), 3))
     moves = order.moves or BodyMotion(rest, rest[:, 0], order.person, 30.0)
     ready, poses, trans = for_programs(rig, moves.poses, moves.trans, axis, order.root, order.names, order.ground,

@@ -58,7 +58,7 @@ def aim_bones(rig: Rig, up: int) -> Rig:
     the front as y allows, or to up where the bone itself points within 60 degrees of the front or back. So x is the
     hinge of elbows, knees and ankles, and left and right mirror each other.
     """
-    vertical, ahead = stance(rig.mesh, vertical=np.eye(3)[up])
+    vertical, ahead = stance(replace(rig.mesh, up=up), vertical=np.eye(3)[up])
     ends, joints = part_ends(rig.skeleton, rig.mesh), rig.skeleton.joints
     axes = np.empty_like(rig.axes)
     for j in range(len(axes)):
@@ -79,10 +79,11 @@ def place_on_ground(rig: Rig, poses: np.ndarray, trans: np.ndarray, up: int, gro
     """Put the rig and its motion (T may be 0) on the ground and turn the face to the viewer, as in `for_programs`."""
     Q = W = np.eye(3)
     if front:
-        Q = to_viewer(*stance(rig.mesh, vertical=np.eye(3)[up]), up)
+        body = replace(rig.mesh, up=up)
+        Q = to_viewer(*stance(body, vertical=np.eye(3)[up]), up)
         if len(poses):
             turned = rig.skeleton.part_rotations(poses)[:, 0]
-            W = to_viewer(*stance(rig.mesh, turned, np.eye(3)[up]), up)
+            W = to_viewer(*stance(body, turned, np.eye(3)[up]), up)
     rig, poses, trans = transform_rig(rig, poses, trans, (Q, np.zeros(3)), (W, np.zeros(3)))
     if not ground:
         return rig, poses, trans
@@ -97,18 +98,16 @@ def place_on_ground(rig: Rig, poses: np.ndarray, trans: np.ndarray, up: int, gro
     return transform_rig(rig, poses, trans, (np.eye(3), shift), (np.eye(3), step))
 
 
-def stand_mesh(body: Mesh, rest: Mesh, up: int | None, ground: bool, front: bool, turned: np.ndarray | None = None
-               ) -> Mesh:
+def stand_mesh(body: Mesh, rest: Mesh, ground: bool, front: bool, turned: np.ndarray | None = None) -> Mesh:
     """Move a mesh's lowest point to height 0 and turn its face to the viewer: -y where z is up, else +z.
 
-    The same body at rest shows which way is front, and up unless `up` (0, 1 or 2) is given. Its root is rotated by
-    `turned` (3, 3) in the mesh.
+    The same body at rest shows which way is up and front. Its root is rotated by `turned` (3, 3) in the mesh.
     """
-    up = guess_upright(rest)[0] if up is None else up
+    up = guess_upright(rest)[0]
     points = body.vertices
     if front:
         points = points @ to_viewer(*stance(rest, turned, np.eye(3)[up]), up).T
-    return body.with_vertices(points - ground * points[:, up].min() * np.eye(3)[up])
+    return body.with_vertices(points - ground * points[:, up].min() * np.eye(3)[up], up)
 
 
 def to_viewer(vertical: np.ndarray, ahead: np.ndarray, up: int) -> np.ndarray:

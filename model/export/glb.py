@@ -85,7 +85,7 @@ def encode_skinned_glb(rig: Rig, poses: np.ndarray | None = None, trans: np.ndar
                        up: int = 2, material: Material | None = None) -> bytes:
     """Encode what `write_skinned_glb` writes, as bytes."""
     U = turn_up(up).T
-    rig, glb = rig.with_up(up), Glb()
+    rig, glb = rig.with_attached().with_up(up), Glb()
     names, targets = rig.beta_targets()
     if rig.correctives is not None:
         names += [f"corrective {k + 1}" for k in range(len(rig.correctives.shapes))]

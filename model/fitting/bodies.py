@@ -386,4 +386,4 @@ def at_rest(model: BodyModel, betas: np.ndarray | None = None) -> Mesh:
     """Compute the body with betas (k,), else the mean person or character, in the pose of the template."""
     pose = np.zeros((len(model.skeleton.parents), 3))
     mean = np.zeros(model.n_betas) if model.n_betas else None
-    return model.template.with_vertices(model.vertices(pose, mean if betas is None else betas))
+    return model.template.with_vertices(model.vertices(pose, mean if betas is None else betas), model.template.up)

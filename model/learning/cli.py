@@ -21,13 +21,14 @@ from scanprep.geometry.files import list_meshes, name_of
 from scanprep.geometry.landmarks import read_landmark_vertices
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.tables import read_table
+from scanprep.geometry.upright import find_up
 from scanprep.judgement import WrongScaleError, carry_judgements
 from scanprep.registration.person import has_limbs
 from scanprep.skeleton.names import note_numbered_parts
 from scanprep.skeleton.roles import joint_in_words
 from scanprep.skeleton.tree import Skeleton
 
-from ..body import BodyModel
+from ..body import BodyModel, Up
 from ..cli import about, read_bodies
 from ..files import BUILT_IN, load_model
 from ..fitting.search import ModelMismatchError
@@ -49,7 +50,7 @@ WITH_PRIOR = "scape", "blendscape"
 
 def learn(poses: Path, output: Output, shapes: Path | None = None, template: Path | None = None,
           skeleton: Path | None = None, landmarks: Path | None = None, subject: Annotated[str | None, Person] = None,
-          unit: Unit | None = None, kind: Kind = "scape", by_sex: bool = False,
+          unit: Unit | None = None, up: Up | None = None, kind: Kind = "scape", by_sex: bool = False,
           prior: str = "auto", scape: LearnConfig = LearnConfig(), skinning: SkinConfig = SkinConfig(),
           mixed: LearnConfig = MIX, *, space: FileWorkspace) -> Outcome:
     """Learn a body model from one person in many poses and many people in about one pose, or from a mix.
@@ -71,6 +72,8 @@ def learn(poses: Path, output: Output, shapes: Path | None = None, template: Pat
         landmarks: Landmarks of the template, kept in the model for `scape complete`; else the set's own.
         subject: Of a registered set, whose meshes are the poses; else of the one with the most.
         unit: Unit of the meshes.
+        up: Axis of the meshes that points up, kept in the model; else as the files say (GLB: y), else that along which
+            the poses stand on their feet, else that of the largest extent.
         kind: SCAPE, BlendSCAPE, linear blend skinning with pose-corrective shapes, or SCAPE from a mix: the poses are
             then those of many people, a registered set that says whose mesh each is.
         prior: Where scans say little, as in this model: a file, "people", "none", or "auto", the built-in people for a
@@ -102,6 +105,7 @@ def learn(poses: Path, output: Output, shapes: Path | None = None, template: Pat
         body, posed, who = whole.template, whole.vertices(), [one.subject or one.name for one in whole.entries]
     else:
         (body, posed), who = read_poses(poses, template, subject, unit), []
+    body = find_up(body if up is None else dataclasses.replace(body, up="xyz".index(up)), posed)
     people = None if shapes is None else _read_people(shapes, body, unit)
     sexes = None if not by_sex or shapes is None else _read_sexes(shapes)
     marks = landmarks or poses / "landmarks.json"

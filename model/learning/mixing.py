@@ -15,6 +15,7 @@ import numpy as np
 
 from scanprep.batch.room import Step, run_uncached
 from scanprep.geometry.mesh import Mesh, check_template
+from scanprep.geometry.upright import find_up
 from scanprep.skeleton.tree import Skeleton
 from scanprep.threads import one_thread
 
@@ -100,6 +101,7 @@ def learn_scape_mix(template: Mesh, bodies: np.ndarray, subjects: Sequence[Hasha
     check_template(template)
     check_skeleton(template, skeleton)
     bodies = check_bodies(template, bodies, "bodies", 2)
+    template = find_up(template, bodies)
     who, parts = number_people(subjects, len(bodies)), BlendedTemplate(template, skeleton, rigid_weights(skeleton))
     mix, inputs = Mix(parts, bodies, who, config), (parts, bodies, who, config)
 

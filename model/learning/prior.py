@@ -15,6 +15,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from scanprep.geometry.carrier import mount
 from scanprep.geometry.mesh import Mesh
 from scanprep.skeleton.tree import Skeleton
 
@@ -22,7 +23,7 @@ from ..body import BodyModel
 from ..fitting.search import lay_model
 from ..posing.transfer import own_body
 from ..priors import sample_poses
-from ..resolution.transfer import mount, transfer_skeleton
+from ..resolution.transfer import transfer_skeleton
 
 
 @dataclass(frozen=True, eq=False)

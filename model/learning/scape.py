@@ -13,6 +13,7 @@ import numpy as np
 from scanprep.batch.pool import SideBySide
 from scanprep.batch.room import Step, run_uncached, substeps
 from scanprep.geometry.mesh import Mesh, check_template
+from scanprep.geometry.upright import find_up
 from scanprep.judgement import HAND, Judgement, extent, size, unit_problem
 from scanprep.skeleton.names import skeleton_doubts
 from scanprep.skeleton.roles import joint_in_words
@@ -125,6 +126,7 @@ def learn_scape(template: Mesh, poses: np.ndarray, shapes: np.ndarray | None, sk
 
     [SCAPE] Eq. 4, Eq. 5, Eq. 7, Eq. 8
     """
+    template = find_up(template, poses)
     parts = BlendedTemplate(template, skeleton, rigid_weights(skeleton))                   # R of each part
     return ScapeModel(template, skeleton,
                       **_learn_spaces(parts, poses, shapes, config, ProgressShares(progress, step), prior))

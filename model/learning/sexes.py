@@ -9,6 +9,7 @@ import numpy as np
 
 from scanprep.batch.room import Step, run_uncached
 from scanprep.geometry.mesh import Mesh
+from scanprep.geometry.upright import find_up
 from scanprep.skeleton.tree import Skeleton
 from scanprep.threads import one_thread
 
@@ -62,6 +63,7 @@ def learn_by_sex(template: Mesh, poses: np.ndarray, shapes: np.ndarray, sexes: S
     """
     config = config or LearnConfig()
     poses, people = check_training(template, skeleton, poses, shapes, prior)
+    template = find_up(template, poses)
     assert people is not None
     sex, groups = np.array(list(sexes), dtype=object), _groups(sexes, len(people))
     parts = BlendedTemplate(template, skeleton, rigid_weights(skeleton))

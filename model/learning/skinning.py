@@ -9,6 +9,7 @@ import numpy as np
 
 from scanprep.batch.room import Step, run_uncached
 from scanprep.geometry.mesh import Mesh
+from scanprep.geometry.upright import find_up
 from scanprep.ranges import Count, Positive, Settings
 from scanprep.skeleton.tree import Skeleton
 from scanprep.threads import one_thread
@@ -104,6 +105,7 @@ def learn_skinning(template: Mesh, poses: np.ndarray, shapes: np.ndarray | None,
     """
     config = config or SkinConfig()
     poses, shapes = check_training(template, skeleton, poses, shapes)
+    template = find_up(template, poses)
     kinds, work = (False, True) if config.correctives else (False,), ProgressShares(progress, step)
 
     def learn(inner: ProgressShares) -> tuple[SkinningModel, np.ndarray]:

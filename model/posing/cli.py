@@ -140,7 +140,7 @@ def mesh(model: ModelArg, output: Output, pose: Path | None = None, betas: tuple
     person = read_subject(loaded, subject) if subject is not None or own_body else loaded.subject(np.array(betas))
     vertices = person.vertices(turns)
     body = loaded.template.with_vertices(vertices)
-    write_mesh(output, stand_mesh(body, loaded.template, None, ground, front, rotations.exp(turns[0])))
+    write_mesh(output, stand_mesh(body, loaded.template, ground, front, rotations.exp(turns[0])))
     return Outcome(output, [Metric("vertices", len(vertices)),
                             Metric("largest extent", float(np.ptp(vertices, axis=0).max()), "m")],
                    judgement=Judgement() if person.betas is None else person_judgement(loaded, person.betas, ASKED))

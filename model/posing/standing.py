@@ -13,11 +13,11 @@ from functools import cached_property
 import numpy as np
 from scipy.spatial import cKDTree
 
+from scanprep.geometry.carrier import SurfaceCarrier, mount
 from scanprep.geometry.mesh import Mesh
 
 from ..body import BodyModel
 from ..fitting.search import lay_model, nearest_by_name
-from ..resolution.transfer import SurfaceCarrier, mount
 from .transfer import own_body
 
 

@@ -7,12 +7,14 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from scanprep.decimation.decimate import DecimateConfig, decimate
+from scanprep.geometry.attached import Attached
+from scanprep.geometry.carrier import mount
 from scanprep.geometry.mesh import Mesh, check_template
 from scanprep.geometry.surface import Surface
 from scanprep.ranges import Settings
 
 from ..body import BodyModel, Progress
-from .transfer import mount, transfer_skeleton
+from .transfer import transfer_skeleton
 
 
 @dataclass(frozen=True)
@@ -70,6 +72,7 @@ def change_resolution(model: BodyModel, template: Mesh, config: ResolutionConfig
     """
     check_template(template)
     _check_same_surface(model.template, template)
+    template = _with_attached(replace(template, up=model.template.up), model.template)
     skeleton = transfer_skeleton(model.skeleton, model.template, template)
     rounds = (config or ResolutionConfig()).rounds
     moved = model.resample(template, skeleton, rounds, progress or (lambda done, total: None))
@@ -80,6 +83,19 @@ def change_resolution(model: BodyModel, template: Mesh, config: ResolutionConfig
         "landmarks": {name: int(v) for name, v in zip(marks, nearest, strict=True)},
         "resolution_of": f"{len(old.vertices)} vertices, {len(old.faces)} triangles"}
     return replace(moved, info=info)                                             # type: ignore[type-var]
+
+
+def _with_attached(template: Mesh, old: Mesh) -> Mesh:
+    """Attach to new triangles of a body what was attached to the old ones: it comes after the vertices of the body."""
+    if old.attached is None:
+        return template
+    others, whole, N = old.attached.others, old.attached.whole, len(template.vertices)
+    place = np.full(len(whole.vertices), -1)
+    place[others] = N + np.arange(len(others))
+    faces = place[whole.faces]
+    mesh = Mesh(np.concatenate([template.vertices, whole.vertices[others]]),
+                np.concatenate([template.faces, faces[(faces >= 0).all(axis=1)]]))
+    return replace(template, attached=Attached(mesh, np.arange(N), template))
 
 
 def resolution_gap(model: BodyModel, changed: BodyModel, poses: np.ndarray, betas: np.ndarray | None = None

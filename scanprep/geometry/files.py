@@ -154,7 +154,7 @@ def _mesh(path: Path, contents: Contents, unit: str | None) -> Mesh:
     """Make the mesh of a file, in metres and with its seams closed."""
     assert contents.faces is not None, "only files with triangles are meshes"
     try:
-        mesh = Mesh(contents.vertices, contents.faces, contents.colors, contents.of_file)
+        mesh = Mesh(contents.vertices, contents.faces, contents.colors, contents.of_file, contents.up)
     except ValueError as error:
         raise MeshFileError(f"{path}: {error}") from None
     mesh = _seamless(path, mesh)
@@ -163,7 +163,7 @@ def _mesh(path: Path, contents: Contents, unit: str | None) -> Mesh:
         more = ", ..." if len(contents.objects) > 6 else ""
         warnings.warn(f"{path}: {len(contents.objects)} objects were taken for one mesh: {listed}{more}", stacklevel=2)
     scale = metres_per_unit(path, mesh.vertices, unit, named=contents.metres)
-    return mesh if scale == 1 else mesh.with_vertices(scale * mesh.vertices)
+    return mesh if scale == 1 else mesh.with_vertices(scale * mesh.vertices, mesh.up)
 
 
 def _seamless(path: Path, mesh: Mesh) -> Mesh:
@@ -179,7 +179,7 @@ def _seamless(path: Path, mesh: Mesh) -> Mesh:
         vertex_of_file = np.where(mesh.of_file < 0, -1, vertex_of[mesh.of_file])
     else:
         vertex_of_file = vertex_of
-    return Mesh(mesh.vertices[first], vertex_of[mesh.faces], colors, vertex_of_file)
+    return Mesh(mesh.vertices[first], vertex_of[mesh.faces], colors, vertex_of_file, mesh.up)
 
 
 def write_mesh(path: str | Path, mesh: Mesh, precision: Precision = "double") -> None:
@@ -190,7 +190,7 @@ def write_mesh(path: str | Path, mesh: Mesh, precision: Precision = "double") ->
     path : str or Path
         `.ply` (binary), `.ply.gz`, `.obj`, `.stl`, `.off` or `.glb`.
     mesh : Mesh
-        The mesh, metres; colours are written where the format has them.
+        The mesh, metres; colours are written where the format has them. What is attached to a body is written with it.
     precision : 'double' or 'single'
         Precision of the coordinates. A 'double' PLY file returns exactly the same numbers. STL and GLB always have
         single precision, a tenth of a micrometre at the size of a person.
@@ -207,7 +207,8 @@ def write_mesh(path: str | Path, mesh: Mesh, precision: Precision = "double") ->
     >>> Path("triangle.obj").exists()
     True
     """
-    _write(Path(path), Contents(mesh.vertices, mesh.faces, None, mesh.colors), precision, _MESHES)
+    mesh = mesh if mesh.attached is None else mesh.attached.mesh(mesh)
+    _write(Path(path), Contents(mesh.vertices, mesh.faces, None, mesh.colors, up=mesh.up), precision, _MESHES)
 
 
 @dataclass(frozen=True, eq=False)
@@ -339,6 +340,7 @@ class Registered(NamedTuple):
     faces: np.ndarray           # (F, 3)
     vertices: np.ndarray        # (M, N, 3), metres
     names: tuple[str, ...]      # of the files, without their endings
+    up: int | None = None       # axis that points up, if the files say it
 
 
 def read_registered(folder: str | Path, unit: str | None = None) -> Registered:
@@ -349,7 +351,7 @@ def read_registered(folder: str | Path, unit: str | None = None) -> Registered:
         meshes.append(read_mesh(path, unit))
         check_same_topology(path, meshes[-1], paths[0], meshes[0])
     return Registered(meshes[0].faces, np.stack([m.vertices for m in meshes]),
-                      tuple(map(name_of, paths)))
+                      tuple(map(name_of, paths)), meshes[0].up)
 
 
 def check_same_topology(path: Path, mesh: Mesh, first_path: Path, first: Mesh) -> None:

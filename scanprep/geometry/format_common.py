@@ -40,6 +40,7 @@ class Contents:
     objects: tuple[tuple[str, int], ...] = ()       # name and triangles of each, where the format has objects
     of_file: np.ndarray | None = None       # (M,) number of each vertex of the file here, -1 if left out
     metres: float = 1.0                     # length of the file's unit, if it names one
+    up: int | None = None                   # axis that points up, if the format says it
 
 
 def load_bytes(path: Path) -> bytes:

@@ -146,7 +146,7 @@ def _scene(path: Path, tree: dict[str, Any], binary: bytes) -> Contents:
         raise MeshFileError(f"{path}: expected a mesh, found a glTF file without triangles and points")
     shades = [c for c in colors if c is not None]
     return Contents(np.concatenate(vertices) @ turn_up(up_of(tree)), np.concatenate(faces), None,
-                    np.concatenate(shades) if len(shades) == len(colors) else None, tuple(objects))
+                    np.concatenate(shades) if len(shades) == len(colors) else None, tuple(objects), up=up_of(tree))
 
 
 def instances_of(tree: dict[str, Any], binary: bytes, node: dict[str, Any], matrix: np.ndarray) -> list[np.ndarray]:
@@ -385,7 +385,7 @@ def _colors(tree: dict[str, Any], binary: bytes, primitive: dict[str, Any], coun
 def encode(contents: Contents, double: bool) -> bytes:
     """Encode one mesh with normals as GLB, always in single precision."""
     assert contents.faces is not None, "a GLB file is written for meshes"
-    up = tallest(contents.vertices)
+    up = tallest(contents.vertices) if contents.up is None else contents.up
     glb, mesh = Glb(), Mesh(contents.vertices @ turn_up(up).T, contents.faces, contents.colors)
     material = {"pbrMetallicRoughness": {"metallicFactor": 0.0, "roughnessFactor": 0.8}}
     return glb.pack(one_mesh({"primitives": [glb.add_surface(mesh)]}, material, {}), up)

@@ -3,6 +3,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from scipy.sparse import coo_array, csr_array
@@ -29,6 +30,10 @@ class Mesh:
     of_file : (M,) int, optional
         The vertex here of each vertex of the file, if its reader merged some; -1 if it was left out. Files with vertex
         numbers refer to those of the mesh file.
+    up : 0, 1 or 2, optional
+        The axis that points up, where it is known. Other vertices may lie, so `with_vertices` asks for it again.
+    attached : scanprep.geometry.attached.Attached, optional
+        Eyes, teeth and loose vertices that follow this body in every file that is written.
 
     Raises
     ------
@@ -46,8 +51,12 @@ class Mesh:
     faces: np.ndarray
     colors: np.ndarray | None = None
     of_file: np.ndarray | None = None
+    up: int | None = None
+    attached: Any = None
 
     def __post_init__(self) -> None:
+        if self.up not in (None, 0, 1, 2):
+            raise ValueError(f"up: expected 0, 1 or 2, got {self.up}")
         vertices = np.array(self.vertices, dtype=np.float64)
         faces = np.array(self.faces, dtype=np.int64)
         if vertices.ndim != 2 or vertices.shape[1] != 3:
@@ -75,9 +84,9 @@ class Mesh:
     def __repr__(self) -> str:
         return f"Mesh({len(self.vertices)} vertices, {len(self.faces)} faces)"
 
-    def with_vertices(self, vertices: np.ndarray) -> Mesh:
-        """Return a mesh with the same triangles and other vertices (N, 3), metres."""
-        return Mesh(vertices, self.faces, self.colors, self.of_file)
+    def with_vertices(self, vertices: np.ndarray, up: int | None = None) -> Mesh:
+        """Return a mesh with the same triangles and other vertices (N, 3), metres; `up` is their axis, where known."""
+        return Mesh(vertices, self.faces, self.colors, self.of_file, up, self.attached)
 
     @cached_property
     def corners(self) -> np.ndarray:
@@ -271,9 +280,13 @@ def template_problem(mesh: Mesh) -> str | None:
     if len(flat):
         return f"{number_of(len(flat), 'triangle has', 'triangles have')} no area, the first is face {flat[0]}"
     if not mesh.is_edge_manifold:
-        return "it is not manifold: some edges have more than two triangles or triangles facing opposite ways"
+        half = np.sort(mesh.faces * len(mesh.vertices) + np.roll(mesh.faces, -1, axis=1), axis=None)
+        first = int(half[1:][half[1:] == half[:-1]][0] // len(mesh.vertices))     # such edges have one direction twice
+        return ("it is not manifold: some edges have more than two triangles or triangles facing opposite ways, the "
+                f"first at {_place(mesh.vertices[first])}")
     if not mesh.is_vertex_manifold:
-        return "it is not manifold: at some vertices separate sheets touch"
+        return f"it is not manifold: at some vertices separate sheets touch, the first at " \
+               f"{_place(mesh.vertices[mesh.non_manifold_vertices[0]])}"
     return None
 
 
@@ -282,6 +295,11 @@ def check_template(mesh: Mesh, name: str = "template") -> None:
     problem = template_problem(mesh)
     if problem:
         raise ValueError(f"{name}: not usable as a template, {problem}")
+
+
+def _place(point: np.ndarray) -> str:
+    """Return a point in words, which no numbering of vertices changes."""
+    return "({:.4g}, {:.4g}, {:.4g}) m".format(*point)
 
 
 def _unit(v: np.ndarray) -> np.ndarray:

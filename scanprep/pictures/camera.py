@@ -128,13 +128,14 @@ def _points(subject: Any) -> np.ndarray:
 def guess_upright(mesh: Mesh) -> tuple[int, float]:
     """Guess the axis that is up, and the azimuth, degrees, of a camera that sees the front; for pictures only.
 
-    Up is the axis of the largest extent, unless arms are spread wider (`tallest`). The front of a one-sided scan is the
-    side that was seen (`outer_side`), else where the toes point. On each foot that is the direction from what lies
-    within a tenth of the height to the lowest twentieth. Of 71 poses of a man it is off by more than 60 degrees in 8.
-    Without feet it is the side from which the body is widest.
+    Up is what the mesh says, as the template of a model (`find_up`), else the axis of the largest extent, unless arms
+    are spread wider (`tallest`). The front of a one-sided scan is the side that was seen (`outer_side`), else where the
+    toes point. On each foot that is the direction from what lies within a tenth of the height to the lowest twentieth.
+    Of 71 poses of a man it is off by more than 60 degrees in 8. Without feet it is the side from which the body is
+    widest.
     """
     extent = np.ptp(mesh.vertices, axis=0)
-    up = tallest(mesh.vertices)
+    up = tallest(mesh.vertices) if mesh.up is None else mesh.up
     if extent[up] == 0:                                                     # a single point has no front
         return up, 0.0
     height = (mesh.vertices[:, up] - mesh.vertices[:, up].min()) / extent[up]

@@ -7,6 +7,7 @@ from typing import Annotated
 
 import numpy as np
 
+from model.body import Up
 from model.linear import Subject
 from model.posing.cli import read_subject
 from scanprep.arguments import Place, UsageError
@@ -34,7 +35,7 @@ MarkersArg = Annotated[Path, Place("MARKERS")]
 def animate_markers(markers: MarkersArg, output: Output, model: ModelOrNone = None, layout: str | None = None,
                     subject: str | None = None, unit: PersonUnit | None = None, rate: Positive | None = None,
                     subject_prefix: str | None = None, retarget_to: Path | None = None, betas_to: Path | None = None,
-                    unlabelled: bool = False, config: AnimateConfig = AnimateConfig(),
+                    unlabelled: bool = False, up: Up | None = None, config: AnimateConfig = AnimateConfig(),
                     person: PersonConfig = PersonConfig(), angles: AngleConfig = AngleConfig(),
                     workers: Workers = Workers(), *, space: Workspace) -> Outcome:
     """The motion of a person from markers, and the person; or a motion of another skeleton on a body.
@@ -75,6 +76,7 @@ def animate_markers(markers: MarkersArg, output: Output, model: ModelOrNone = No
             {"0": [...], "2.5": [...]}, or [[b1, b2, ...], ...] of every frame: morph.glb.
         unlabelled: The markers have no names: they are labelled first, as by `scape label`; --layout says which are
             worn.
+        up: Axis of the model that points up, which GLB and BVH turn to y; else as the model says.
         config: Settings.
         person: Settings of the person from markers.
         angles: Settings of the joint angles.
@@ -96,6 +98,7 @@ def animate_markers(markers: MarkersArg, output: Output, model: ModelOrNone = No
     # model, subject and all that the files share
     units = resolve_marker_unit([markers], unit)
     loaded, name = read_model(model)
+    loaded = loaded.with_up(up)
     body = loaded if subject == "markers" else body_of(loaded, subject, unit)
     work = AnimateTask(loaded, name, None if layout is None else layout_or_file(layout),
                        body if isinstance(body, Subject) else None,

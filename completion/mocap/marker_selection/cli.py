@@ -98,7 +98,7 @@ def _read_bodies(model: BodyModel, folder: Path, unit: Unit | None) -> tuple[np.
         faces, vertices = whole.template.faces, whole.vertices(tuple(entry.name for entry in whole.entries))
         people = np.unique([entry.subject for entry in whole.entries], return_inverse=True)[1]
     else:
-        faces, vertices, _ = read_registered(folder, unit)
+        faces, vertices, *_ = read_registered(folder, unit)
         people = np.arange(len(vertices))
     if not np.array_equal(faces, model.template.faces):
         raise ValueError(f"{folder}: expected the triangles of the model ({model.template}); these have {len(faces)} "
