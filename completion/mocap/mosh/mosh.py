@@ -16,6 +16,7 @@ from model.linear import Subject
 from scanprep.batch.room import Step, run_uncached, substeps
 from scanprep.ranges import Settings
 from scanprep.threads import one_thread
+from scanprep.words import describe_result
 
 from ...motion import Motion, Progress
 from ..angle_conventions import AngleConfig, define_segments, find_landmarks
@@ -143,8 +144,8 @@ class MoshResult:
     >>> from completion import load_layout
     >>> from model import load_built_in_model
     >>> model = load_built_in_model()
-    >>> layout = load_layout("cmu41", model.template, np.array(model.info["people_vertices"]))
-    >>> still = MarkerSequence(np.stack([layout.place(model.template)] * 4), layout.labels, 120.0)
+    >>> layout = load_layout("cmu41", model)
+    >>> still = MarkerSequence(np.stack([layout.place(model)] * 4), layout.labels, 120.0)
     >>> quick = MoshConfig(PersonConfig(frames=2, n_betas=3, annealing=(10.0, 1.0)), soft_tissue=False, repair=False)
     >>> result = mosh(still, config=quick)
     >>> result.betas.shape, sorted(result.seconds)
@@ -165,6 +166,7 @@ class MoshResult:
     misplaced: MisplacedMarkers = field(default_factory=MisplacedMarkers)
     seconds: dict[str, np.ndarray] = field(default_factory=dict)
     angles: AngleConfig = field(default_factory=AngleConfig)
+    __repr__ = describe_result
 
     @cached_property
     def subject(self) -> Subject:
@@ -224,8 +226,8 @@ def mosh(recordings: MarkerSource | Sequence[MarkerSource], model: BodyModel | N
     >>> from completion import load_layout
     >>> from model import load_built_in_model
     >>> model = load_built_in_model()
-    >>> layout = load_layout("cmu41", model.template, np.array(model.info["people_vertices"]))
-    >>> still = MarkerSequence(np.stack([layout.place(model.template)] * 4), layout.labels, 120.0)
+    >>> layout = load_layout("cmu41", model)
+    >>> still = MarkerSequence(np.stack([layout.place(model)] * 4), layout.labels, 120.0)
     >>> write_markers("still.c3d", still)
     >>> quick = PersonConfig(frames=2, n_betas=3, annealing=(10.0, 1.0))
     >>> result = mosh("still.c3d", config=MoshConfig(quick, soft_tissue=False, repair=False))
