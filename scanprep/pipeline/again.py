@@ -87,11 +87,14 @@ def register_scans(scans: str | Path, template: str | Path, output: str | Path, 
 
     Examples
     --------
-    >>> from scanprep import RegistrationConfig, SyntheticPerson, write_mesh
+    >>> import igl
+    >>> from scanprep import Mesh, RegistrationConfig, write_mesh
     >>> from scanprep.pipeline.prepare import PrepareConfig, ScanSettings
-    >>> person = SyntheticPerson().mesh
-    >>> write_mesh("template.ply", person)
-    >>> write_mesh("scans/anna.ply", person.with_vertices(1.01 * person.vertices))
+    >>> vertices, faces = igl.icosahedron()
+    >>> vertices, faces = igl.upsample(vertices, faces.astype(np.int64), 2)
+    >>> ball = Mesh(vertices / np.linalg.norm(vertices, axis=1, keepdims=True), faces)
+    >>> write_mesh("template.ply", ball)
+    >>> write_mesh("scans/anna.ply", ball.with_vertices(1.1 * ball.vertices))
     >>> quick = PrepareConfig(ScanSettings(RegistrationConfig.quick(), through="pose"))
     >>> register_scans("scans", "template.ply", "set", config=quick).registered.names
     ('anna',)
