@@ -1,4 +1,5 @@
 # The public names; loaded when they are first used, so that the command line answers at once.
+from .measuring.whole import measure_completion as measure_completion
 from .mocap.angle_conventions import AngleConfig as AngleConfig
 from .mocap.artefacts.find import find_artefacts as find_artefacts
 from .mocap.artefacts.results import write_virtual as write_virtual

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from model.linear import Subject
+from model.linear import Subject, check_subject
 from model.motion.files import check_ours, read_motion_file
 from model.motion.onto import BodyMotion
 from scanprep.geometry import storage
@@ -118,7 +118,7 @@ class Motion:
         -------
         (n, N, 3) float, metres
         """
-        return subject.vertices(self.poses[frames], self.trans[frames])
+        return check_subject(subject).vertices(self.poses[frames], self.trans[frames])
 
     def save(self, path: str | Path, **more: np.ndarray) -> None:
         """Write an `.npz` with the array names of body-model files, poses as (T, 3J).

@@ -8,6 +8,7 @@ from .coregistration.single import ModelRegistration as ModelRegistration
 from .coregistration.single import register_with_model as register_with_model
 from .evaluation.errors import pose_errors as pose_errors
 from .evaluation.errors import shape_errors as shape_errors
+from .evaluation.sampling import sample_bodies as sample_bodies
 from .export.correctives import write_body_npz as write_body_npz
 from .export.glb import write_skinned_glb as write_skinned_glb
 from .files import load_model as load_model
@@ -18,6 +19,7 @@ from .fitting.vertices import fit_pose as fit_pose
 from .fitting.vertices import fit_shape as fit_shape
 from .importing import import_model as import_model
 from .learning.config import LearnConfig as LearnConfig
+from .learning.prior import bring_prior as bring_prior
 from .learning.scape import learn_blendscape as learn_blendscape
 from .learning.scape import learn_scape as learn_scape
 from .learning.skinning import SkinConfig as SkinConfig
@@ -34,6 +36,7 @@ from .posing.poses import pose_from_angles as pose_from_angles
 from .posing.transfer import subject_from_body as subject_from_body
 from .priors import sample_poses as sample_poses
 from .resolution.change import change_resolution as change_resolution
+from .rig import make_rig as make_rig
 from .scape import BlendScapeModel as BlendScapeModel
 from .scape import ScapeModel as ScapeModel
 from .shape_statistics import shape_statistics as shape_statistics

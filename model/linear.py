@@ -15,6 +15,7 @@ from scipy.sparse import csr_array, sparray
 
 from scanprep.geometry.mesh import Mesh
 from scanprep.skeleton.tree import Skeleton
+from scanprep.words import describe_result
 
 
 def check_pose(skeleton: Skeleton, pose: Any, trans: Any) -> tuple[np.ndarray, np.ndarray]:
@@ -127,6 +128,14 @@ class PointOperator(SurfaceCombination):
         return y, d_pose
 
 
+def check_subject(body: Any) -> Subject:
+    """Return a subject as it is; TypeError for a model, which is of nobody, that says how to make one."""
+    if not isinstance(body, Subject):
+        raise TypeError(f"subject: expected a Subject, got a {type(body).__name__}; model.subject(betas) is a person, "
+                        "model.subject(None) the template's own body")
+    return body
+
+
 @dataclass(frozen=True, eq=False)
 class Subject:
     """A body of fixed shape, ready to be posed fast; made by `BodyModel.subject`.
@@ -169,6 +178,7 @@ class Subject:
     pose_examples: np.ndarray | None = None
     left_out_error: float | None = None
     regressor: csr_array | None = None
+    __repr__ = describe_result
 
     @property
     def n_vertices(self) -> int:

@@ -150,10 +150,22 @@ def make_rig(model: BodyModel, betas: np.ndarray | None = None, shapes: int = 0,
     weights : (N, J) float, optional
         Without them, those of a skinning model or of `skin_weights`. The largest `CARRIERS` of every vertex are kept.
 
+    Returns
+    -------
+    Rig
+        The mesh at rest with its skeleton, weights (N, J) and shapes, as `write_skinned_glb` takes it.
+
     Raises
     ------
     ValueError
         Weights of another shape, shapes of the template's own body.
+
+    Examples
+    --------
+    >>> from model import load_built_in_model
+    >>> rig = make_rig(load_built_in_model(), np.zeros(2), shapes=2)
+    >>> rig.weights.shape, rig.shapes.shape
+    ((5002, 16), (2, 5002, 3))
     """
     if shapes and betas is None:
         raise ValueError(f"shapes: the template's own body has none, got {shapes}")

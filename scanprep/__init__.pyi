@@ -22,11 +22,14 @@ from .geometry.landmarks import read_landmark_vertices as read_landmark_vertices
 from .geometry.landmarks import read_landmarks as read_landmarks
 from .geometry.landmarks import write_landmarks as write_landmarks
 from .geometry.mesh import Mesh as Mesh
+from .pipeline.again import register_scans as register_scans
 from .registration.nonrigid import Registration as Registration
-from .registration.nonrigid import register as register
 from .registration.schedule import RegistrationConfig as RegistrationConfig
+from .registration.verdict import register as register
 from .repair.hole_filling import FillConfig as FillConfig
 from .repair.hole_filling import fill_holes as fill_holes
 from .skeleton.find import SkeletonConfig as SkeletonConfig
 from .skeleton.find import find_skeleton as find_skeleton
 from .skeleton.tree import Skeleton as Skeleton
+from .surfaces.template import make_template as make_template
+from .synthetic.people import SyntheticPerson as SyntheticPerson

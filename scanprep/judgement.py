@@ -92,6 +92,9 @@ class Judgement:
         return f"{self.verdict}: {self.why}" if self.reasons else self.verdict
 
 
+UNJUDGED = Judgement.of(check=["no judgement was made"])
+
+
 def judge_many(results: Mapping[str, Judgement], failures: int = 0) -> Judgement:
     """Judge many results together.
 

@@ -1,6 +1,9 @@
 """Texts of messages for users: numbers with nouns, and the modules whose warnings are shown."""
 from __future__ import annotations
 
+from dataclasses import fields
+from typing import Any
+
 OUR_MODULES = r"(scanprep|model|completion)(\.|$)"     # modules whose warnings are notes for users
 
 
@@ -13,3 +16,34 @@ def number_of(count: int, one: str, several: str = "") -> str:
     ('1 flap', '1,200 flaps', '3 people')
     """
     return f"{count:,} {one if count == 1 else several or one + 's'}"
+
+
+def describe_result(result: Any) -> str:
+    """Describe a dataclass in one line, to be its `__repr__`: its verdict, numbers, shapes of arrays, and counts.
+
+    Examples
+    --------
+    >>> from dataclasses import dataclass
+    >>> @dataclass
+    ... class Fit:
+    ...     rms: float
+    ...     parts: tuple[str, ...]
+    ...     __repr__ = describe_result
+    >>> Fit(0.00123456, ("head", "chest"))
+    Fit(rms=0.00123, parts=2)
+    """
+    told = list[str]()
+    for field in fields(result):
+        value = getattr(result, field.name)
+        kind = type(value)
+        if hasattr(value, "verdict"):
+            told.insert(0, value.verdict)
+        elif getattr(value, "shape", ()):
+            told.append(f"{field.name}={value.shape}")
+        elif isinstance(value, float):
+            told.append(f"{field.name}={value:.3g}")
+        elif isinstance(value, dict | list | tuple):
+            told += [f"{field.name}={len(value)}"] if value else []
+        elif value is not None and not callable(value) and not hasattr(kind.__repr__, "__wrapped__"):
+            told.append(f"{field.name}={value!r}")
+    return f"{type(result).__name__}({', '.join(told)})"

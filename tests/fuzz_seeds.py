@@ -17,7 +17,7 @@ from completion.mocap.files.c3d import replace_points
 from completion.mocap.mosh.recordings import _table_rows
 from completion.mocap.soft_tissue.soft_tissue import SoftTissue
 from completion.motion import Motion
-from completion.partial.completion import Completion, load_completion, save_completion
+from completion.partial.completion import Completion, load_completion
 from completion.partial.masks import read_mask
 from model.export.bvh import write_bvh
 from model.files import KINDS as known_kinds  # noqa: N811
@@ -262,7 +262,7 @@ def _add_sets(rng: np.random.Generator, place: Any, add: Any, text: Any) -> None
                       0.001, 0.9, float("nan"), True, 5, {"data": 1.0}, 1.0, np.ones(len(body.vertices)),
                       np.ones(len(body.vertices)))
     for name in ("completion.npz", "predicted.ply"):
-        save_completion(place("done"), done)
+        done.save(place("done"))
         add(place("done") / name, lambda path: load_completion(path.parent), good_completion)
     source, config = filled(place("source")), DecimateSetConfig(meshes=1)
     write_decimated_set(source, place("small"), 60, config)

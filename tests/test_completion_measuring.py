@@ -14,7 +14,7 @@ from completion.__main__ import main
 from completion.measuring import template
 from completion.measuring.bodies import read_bodies
 from completion.measuring.page import measures_page
-from completion.partial.completion import Completion, save_completion
+from completion.partial.completion import Completion
 from model import find_tapes, measure
 from model.measurement.catalogue import CATALOGUE
 from model.measurement.survey import ordinal, percentiles
@@ -179,7 +179,7 @@ def test_a_completion_states_errors(folder, tmp_path):
     n = len(body.vertices)
     done = Completion(body, body, np.zeros((16, 3)), np.zeros(4), np.zeros(3), np.ones(n, bool), 0.001, 1.0, 0.001,
                       True, 3, expected_error=np.full(n, 0.004), judgement=Judgement())
-    save_completion(tmp_path / "whole", done)
+    done.save(tmp_path / "whole")
     (tmp_path / "whole" / "report.json").write_text(json.dumps({"settings": {"model": str(folder / "model.npz")}}))
     assert scape(tmp_path / "whole", "-o", tmp_path / "m.csv") == 0
     row = table(tmp_path / "m.csv")["whole"]

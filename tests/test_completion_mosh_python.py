@@ -1,6 +1,7 @@
 """`mosh` from Python is as simple as the command: files, the set recognised, the built-in people; angles as a table."""
 import json
 import sys
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -107,6 +108,9 @@ def test_angles_are_a_table_with_names(monkeypatch, tmp_path):
     table, motion, subject = found.joint_angles(), found.motions[0], found.subject
     monkeypatch.setitem(sys.modules, "pandas", SimpleNamespace(DataFrame=lambda columns: ("frame", columns)))
     kind, columns = found.joint_angles()
+    assert found.judgement.verdict == "good", found.judgement.why
+    bare = replace(found, motions=(replace(motion, residuals=motion.residuals * np.nan),))
+    assert bare.judgement.verdict == "failed" and "no marker" in bare.judgement.why
     assert isinstance(table, dict) and kind == "frame" and columns.keys() == table.keys()
     np.testing.assert_allclose(table["time"], np.arange(FRAMES) / RATE)
     pelvis = follow_pelvis(motion, subject, found.layout, found.artefacts[0].repaired)

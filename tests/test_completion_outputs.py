@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from completion_bodies import MEAN, worm_with_prior
 
-from completion.mocap.files.motion_files import joint_angles, joint_centres, write_motion_folder
+from completion.mocap.files.motion_files import joint_angles, joint_centres, rotation_vectors, write_motion_folder
 from completion.mocap.retargeting.retarget import betas_over_time, lowest_heights, morph_vertices, retarget, world_up
 from completion.motion import Motion
 from scanprep.geometry.rotations import exp, log
@@ -45,7 +45,7 @@ def table(path):
 def test_joint_angles_are_the_rotations_without_jumps(motion, model, subject, tmp_path):
     cut = Motion(motion.poses.copy(), motion.trans, None, 20.0, np.zeros((FRAMES, 0)))
     cut.poses[:] = log(exp(motion.poses))                          # jumps where the chart ends
-    degrees = joint_angles(cut)
+    degrees = rotation_vectors(cut)
     assert np.abs(np.diff(cut.poses, axis=0)).max() > 3 and np.abs(np.diff(degrees, axis=0)).max() < 40
     np.testing.assert_allclose(exp(np.radians(degrees)), exp(motion.poses), atol=1e-9)
     write_motion_folder(tmp_path, cut, subject)
@@ -54,6 +54,8 @@ def test_joint_angles_are_the_rotations_without_jumps(motion, model, subject, tm
     assert head[:4] == ["time", f"{first}_rx", f"{first}_ry", f"{first}_rz"] and head[-1] == f"{last}_rz"
     np.testing.assert_allclose(rows[:, 1:], degrees.reshape(FRAMES, -1), rtol=1e-5, atol=1e-6)
     np.testing.assert_allclose(rows[:, 0], np.arange(FRAMES) / 20, atol=1e-6)
+    angles = joint_angles(cut, subject)
+    assert list(angles) == head and np.array_equal(angles[f"{last}_rz"], degrees[:, -1, 2])
 
 
 def test_joint_centres_are_those_of_the_surface(motion, subject, tmp_path):

@@ -3,7 +3,7 @@ import pytest
 from completion_bodies import half_view, worm_with_prior
 
 from completion.partial import completion as completing
-from completion.partial.completion import complete, load_completion, save_completion
+from completion.partial.completion import complete, load_completion
 from completion.partial.settings import CompletionConfig
 from model.fitting import energy
 from model.fitting.bodies import FixedBody
@@ -87,8 +87,8 @@ def test_soles_that_come_to_rest_on_a_floor_are_told(model, known, monkeypatch, 
     stands = complete(model.subject(None), points, landmarks, QUICK)
     np.testing.assert_allclose(stands.completed.vertices, result.completed.vertices + 0.01)
     assert result.soles is None and stands.soles == (0.022, 0.001)
-    assert load_completion(save_completion(tmp_path, stands)).soles == (0.022, 0.001)
-    assert load_completion(save_completion(tmp_path, result)).soles is None
+    assert load_completion(stands.save(tmp_path)).soles == (0.022, 0.001)
+    assert load_completion(result.save(tmp_path)).soles is None
 
 
 def test_a_mesh_with_borders_serves_as_scan(model, known):

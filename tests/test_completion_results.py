@@ -12,7 +12,6 @@ from completion.partial.completion import (
     completion_doubts,
     find_unexplained,
     load_completion,
-    save_completion,
 )
 from completion.partial.settings import CompletionConfig
 from model.fitting.bodies import FixedBody
@@ -40,7 +39,7 @@ def made(betas):
 @pytest.mark.parametrize("betas", [None, np.arange(3.0)], ids=["known", "unknown"])
 def test_a_completion_comes_back_from_its_folder(tmp_path, betas):
     saved = made(betas)
-    again = load_completion(save_completion(tmp_path, saved))
+    again = load_completion(saved.save(tmp_path))
     for name in ("pose", "trans", "seen", "expected_error", "confidence"):
         np.testing.assert_array_equal(getattr(again, name), getattr(saved, name))
     assert again.betas is None if betas is None else np.array_equal(again.betas, betas)
@@ -53,7 +52,7 @@ def test_a_completion_comes_back_from_its_folder(tmp_path, betas):
 
 def test_a_folder_of_the_first_version_is_read_without_what_it_lacks(tmp_path):
     saved = made(None)
-    save_completion(tmp_path, saved)
+    saved.save(tmp_path)
     path = tmp_path / "completion.npz"
     with np.load(path) as kept:
         header = json.loads(str(kept["header"]))
@@ -63,12 +62,12 @@ def test_a_folder_of_the_first_version_is_read_without_what_it_lacks(tmp_path):
     again = load_completion(tmp_path)
     assert again.scale == 1 and again.expected_error is None and again.confidence is None and again.rms == saved.rms
     assert again.judgement.verdict == "check" and "no judgement" in again.judgement.why
-    save_completion(tmp_path, again)
+    again.save(tmp_path)
     assert load_completion(tmp_path).confidence is None
 
 
 def test_a_folder_that_lacks_an_array_is_refused(tmp_path):
-    save_completion(tmp_path, made(None))
+    made(None).save(tmp_path)
     storage.save(tmp_path / "completion.npz", "completion", 2, {"pose": np.zeros((4, 3))}, {})
     with pytest.raises(storage.StorageError, match="it lacks"):
         load_completion(tmp_path)

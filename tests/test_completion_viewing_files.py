@@ -14,7 +14,7 @@ from viewing_apps import a_motion, app_of, ask, write_files
 
 from completion import MarkerSequence, Motion, write_markers
 from completion.__main__ import main
-from completion.partial.completion import Completion, save_completion
+from completion.partial.completion import Completion
 from completion.viewing import files as reading
 from completion.viewing.arrangement import arrange_side_by_side
 from completion.viewing.contents import Stance, of_mesh
@@ -105,7 +105,7 @@ def test_a_completion_has_its_errors_as_heat(model, tmp_path):
                       landmark_rms=0.0, converged=True, iterations=3, energies={}, scale=1.0,
                       expected_error=np.linspace(0, 0.05, N), confidence=np.ones(N))
     (tmp_path / "done").mkdir()
-    save_completion(tmp_path / "done", done)
+    done.save(tmp_path / "done")
     content = app_of(tmp_path, "done").contents[0]
     assert set(content.shapes[0].shades) == {"seen", "expected error"}
     assert [shape.visible for shape in content.shapes] == [True, False]

@@ -254,7 +254,7 @@ def files(folder, *but):
 @pytest.fixture
 def counted():
     """Calls of the long stages after the scans, of the small demonstration."""
-    calls = {name: 0 for name in ("make_template", "prepare", "learn_scape", "complete", "record_walk", "animate")}
+    calls = {name: 0 for name in ("template_of_views", "prepare", "learn_scape", "complete", "record_walk", "animate")}
 
     def count(name, real):
         def counting(*given, **named):

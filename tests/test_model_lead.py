@@ -19,10 +19,10 @@ from scanprep.decimation.decimate import decimate
 from scanprep.geometry.rotations import exp
 from scanprep.geometry.surface import Surface
 from scanprep.registration import person
-from scanprep.registration.cli import judge_registration
 from scanprep.registration.lead import Proposal, find_scanned_person, lead_of
 from scanprep.registration.nonrigid import register
 from scanprep.registration.unmarked import Candidate, find_rival, register_by_any, weigh_doubts
+from scanprep.registration.verdict import judge_registration
 from scanprep.synthetic.people import BodyShape, SyntheticPerson, find_pose
 
 

@@ -8,7 +8,6 @@ from completion.partial.completion import (
     Completion,
     complete,
     load_completion,
-    save_completion,
     tell_worn,
     widen_errors,
 )
@@ -259,7 +258,7 @@ def test_the_body_is_sought_inside_trousers(tmp_path):
     assert off < 0.67 * off_as_skin
     assert np.median(inside.expected_error[legs]) > 2 * np.median(inside.expected_error[~legs])
     # files
-    folder = save_completion(tmp_path / "done", inside)
+    folder = inside.save(tmp_path / "done")
     again = load_completion(folder)
     np.testing.assert_array_equal(again.not_skin, inside.not_skin)
     assert again.worn == inside.worn

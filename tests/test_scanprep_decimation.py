@@ -15,7 +15,7 @@ from scanprep.geometry.mesh import Mesh, template_problem
 from scanprep.geometry.surface import Surface
 from scanprep.repair.intersections import intersecting_faces
 from scanprep.repair.manifold import weld
-from scanprep.surfaces.template import TemplateConfig, make_template
+from scanprep.surfaces.template import TemplateConfig, template_of_views
 from scanprep.synthetic.scanner import ScannerConfig, scan
 
 
@@ -236,7 +236,7 @@ def test_views_become_a_template():
     some = [d for d in SIX if tuple(d) != (0, 0, -1)]               # nobody looks from below
     views = [view(shape, d, rng, noise=0.0005) for d in some]
     done = []
-    template = make_template(views, 3000, TemplateConfig(merge=MergeConfig(voxel=0.005)),
+    template = template_of_views(views, 3000, TemplateConfig(merge=MergeConfig(voxel=0.005)),
                              progress=lambda *state: done.append(state))
     assert template.is_closed and template_problem(template) is None
     assert done == [(i, 4) for i in range(1, 5)]
@@ -253,7 +253,7 @@ def test_views_of_a_real_body_become_a_template():
         pytest.skip("SCAPEKIT_DATA does not point at the real scans")
     body = read_mesh(Path(folder) / "scape_poses" / "mesh000.ply")
     views = scan(body, ScannerConfig(views=4, noise=0.002)).views
-    template = make_template(views, 8000, TemplateConfig(merge=MergeConfig(voxel=0.01, min_cosine=0.15)))
+    template = template_of_views(views, 8000, TemplateConfig(merge=MergeConfig(voxel=0.01, min_cosine=0.15)))
     assert template.is_closed and template_problem(template) is None
     at = Surface(body).closest(template.vertices)
     assert at.distances.mean() < 0.002

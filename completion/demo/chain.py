@@ -28,7 +28,7 @@ from scanprep.pipeline.again import Call
 from scanprep.pipeline.prepare import SCANS, Prepared, prepare
 from scanprep.pipeline.scans import TABLE, find_scans
 from scanprep.ranges import Cell, Count, Faces, Positive, Seed, Settings
-from scanprep.surfaces.template import TemplateConfig, make_template
+from scanprep.surfaces.template import TemplateConfig, template_of_views
 from scanprep.synthetic.data_set import (
     SUBJECT,
     GroundTruth,
@@ -48,7 +48,7 @@ from ..mocap.files.markers import MarkerSequence, read_markers, write_markers
 from ..mocap.marker_sets.layout import DISTANCE, MarkerLayout
 from ..mocap.pose.follow import animate
 from ..motion import Motion
-from ..partial.completion import Completion, complete, load_completion, save_completion
+from ..partial.completion import Completion, complete, load_completion
 from .sample import MARKER_NOISE, record_markers
 from .truth import TruthMap, distance, surface_error
 
@@ -172,7 +172,7 @@ class Demo:
                     write_mesh(place / "range_views" / f"{name}.ply", view.mesh)
                 storage.write_json(place / "range_views" / "cameras.json",
                                    {name: view.camera.tolist() for name, view in named.items()})
-                mesh = make_template(views, self.config.faces, settings, progress)
+                mesh = template_of_views(views, self.config.faces, settings, progress)
             landmarks = read_landmark_vertices(place / "rest.landmarks.json", mesh)
             write_landmarks(folder / "template.landmarks.json", landmarks)
             write_mesh(folder / "template.ply", mesh)
@@ -280,7 +280,7 @@ class Demo:
         def make(folder: Path) -> None:
             _, vertices, points = match_landmarks(self.template_landmarks, marks)
             with self.bar("completing a half view") as progress:
-                save_completion(folder / "completed", complete(subject, half, (vertices, points), progress=progress))
+                complete(subject, half, (vertices, points), progress=progress).save(folder / "completed")
 
         self.space.step("completion", (self.folder / MODEL, self.folder / HALF, self.template_landmarks, marks), make)
         return load_completion(self.folder / "completed")

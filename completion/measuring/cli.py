@@ -13,7 +13,6 @@ from model.built_in import load_built_in_model
 from model.files import load_model
 from model.measurement.catalogue import CATALOGUE, plain
 from model.measurement.measure import Measurements, measure
-from model.measurement.person import measure_person
 from model.measurement.plausible import implausible_measures
 from model.measurement.survey import ordinal, percentiles
 from model.measurement.wanted import WantedBody, body_with_measurements, check_wanted
@@ -32,7 +31,7 @@ from scanprep.words import number_of
 from ..cli import ModelOrNone, read_model
 from .bodies import Body, model_of, read_bodies
 from .page import likely_section, measures_page
-from .template import TapedTemplate, tape_template
+from .template import TapedTemplate, measure_body, tape_template
 
 BodiesArg = Annotated[tuple[Path, ...], Place("[BODY ...]")]
 
@@ -90,15 +89,11 @@ def measure_bodies(bodies: BodiesArg = (), *, output: Output, model: ModelOrNone
 
 def measure_all(bodies: Sequence[Body], template: TapedTemplate) -> list[Measurements]:
     """Measure bodies; each with `Measurements.body` as it was measured."""
-    measured, tapes = list[Measurements](), template.tapes
+    measured = list[Measurements]()
     with bar("measuring") as progress:
-        for number, body in enumerate(bodies):
-            vertices, error = body.mesh.vertices, body.expected_error
-            if body.betas or template.standing is None:
-                measured.append(measure(vertices, tapes, tapes.axes if body.betas else None, error))
-            else:
-                measured.append(measure_person(vertices, tapes, template.standing, tapes.axes, error))
-            progress(number + 1, len(bodies))
+        for body in bodies:
+            measured.append(measure_body(body, template))
+            progress(len(measured), len(bodies))
     return measured
 
 

@@ -13,7 +13,8 @@ from model.built_in import load_built_in_model
 from model.fitting.search import ModelMismatchError
 from model.measurement.find import find_tapes
 from model.measurement.marks import MEASURED
-from model.measurement.measure import stands
+from model.measurement.measure import Measurements, measure, stands
+from model.measurement.person import measure_person
 from model.measurement.tapes import Tapes
 from model.people import stature_and_volume
 from model.posing.standing import StandingModel
@@ -88,6 +89,14 @@ def tape_template(file: Path | None, bodies: Sequence[Body], model: BodyModel | 
             return TapedTemplate(tapes, None)
     upright = template.with_vertices(people.stand(template.vertices).vertices)
     return TapedTemplate(find_tapes(upright, known), people)
+
+
+def measure_body(body: Body, template: TapedTemplate) -> Measurements:
+    """Measure one body; its `Measurements.body` is the body as it was measured."""
+    vertices, tapes, error = body.mesh.vertices, template.tapes, body.expected_error
+    if body.betas or template.standing is None:
+        return measure(vertices, tapes, tapes.axes if body.betas else None, error)
+    return measure_person(vertices, tapes, template.standing, tapes.axes, error)
 
 
 def collect_landmarks(file: Path | None, bodies: Sequence[Body], model: BodyModel | None

@@ -48,7 +48,7 @@ def expect_angle_errors(motion: Motion, subject: Subject, layout: MarkerLayout, 
     >>> from completion import load_layout
     >>> from model import load_built_in_model
     >>> model = load_built_in_model()
-    >>> layout = load_layout("cmu41", model.template, np.array(model.info["people_vertices"]))
+    >>> layout = load_layout("cmu41", model)
     >>> motion = Motion(np.zeros((4, 16, 3)), np.zeros((4, 3)), None, 120.0, np.zeros((4, 41)), layout.labels)
     >>> expect_angle_errors(motion, model.subject(), layout).shape
     (4, 48)

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from model.linear import Subject
+from model.linear import Subject, check_subject
 from scanprep.geometry import rotations
 from scanprep.skeleton.roles import above, find_numbered_roles
 
@@ -293,7 +293,7 @@ def angle_doubts(motion: Motion, subject: Subject, told: np.ndarray) -> tuple[st
 
 
 def angle_table(motion: Motion, subject: Subject, known: Known = NOTHING_KNOWN) -> Any:
-    """Compute the joint angles of a person in motion as a table of named columns.
+    """Compute the anatomical joint angles of a person in motion, by ISB, as a table of named columns.
 
     Parameters
     ----------
@@ -324,7 +324,12 @@ def angle_table(motion: Motion, subject: Subject, known: Known = NOTHING_KNOWN) 
     >>> float(table["time"][1]), abs(float(table["lumbar_extension"][0])) < 1e-9
     (0.01, True)
     """
-    columns = anatomical_angles(motion, subject, subject.joints(motion.poses, motion.trans), known).columns(motion.rate)
+    centres = check_subject(subject).joints(motion.poses, motion.trans)
+    return as_table(anatomical_angles(motion, subject, centres, known).columns(motion.rate))
+
+
+def as_table(columns: dict[str, np.ndarray]) -> Any:
+    """Return columns of equal length as a table of pandas, or as they are where it is not installed."""
     try:
         import pandas  # optional: nothing else here needs it
     except ImportError:

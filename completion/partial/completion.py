@@ -29,13 +29,14 @@ from scanprep.geometry import storage
 from scanprep.geometry.attached import take_body
 from scanprep.geometry.files import check_same_topology, read_mesh, write_mesh
 from scanprep.geometry.geodesics import SurfaceGraph
-from scanprep.geometry.mesh import Mesh
+from scanprep.geometry.mesh import Mesh, take_any_mesh
 from scanprep.geometry.surface import Surface
-from scanprep.judgement import HAND, Judgement, extent, size, unit_problem
+from scanprep.judgement import HAND, UNJUDGED, Judgement, extent, size, unit_problem
 from scanprep.registration.ground import foot_of_vertex, put_on_floor
 from scanprep.skeleton.roles import in_words, joint_in_words, part_kind
 from scanprep.skeleton.tree import Skeleton
 from scanprep.threads import one_thread
+from scanprep.words import describe_result
 
 from .alternation import turns_of
 from .inputs import prepare_in_metres
@@ -67,7 +68,6 @@ LEFT_ALONE = 0.95
 CLOSE_ERROR = 0.014                  # metres: clothes as close as skin make girths 22 to 75 mm wider
 BESIDE = 0.04                        # metres from clothes, within which what seems to be skin may be clothes
 MASK = "mask.json"
-UNJUDGED = Judgement.of(check=["no judgement was made"])
 # Landmarks off by more than ASTRAY of the body's size, with less than ENOUGH of the scan explained, mean that left and
 # right are exchanged. Either alone also occurs in correct results.
 ASTRAY, ENOUGH = 0.016, 0.9
@@ -147,11 +147,41 @@ class Completion:
     soles: tuple[float, float] | None = None
     not_skin: np.ndarray | None = None
     worn: tuple[str, ...] = ()
+    __repr__ = describe_result
 
     @property
     def measured(self) -> float:
         """Share of the body's surface that was observed."""
         return self.completed.share_of_area(self.seen)
+
+    def save(self, folder: str | Path) -> Path:
+        """Write the completion as `scape complete` does; `load_completion` reads it.
+
+        Where hair or clothes were found, `mask.json` lists their points, to be corrected. `completion.npz` is written
+        last: where it exists, the meshes do too.
+
+        Parameters
+        ----------
+        folder : str or Path
+            For `completed.ply`, `predicted.ply` and `completion.npz` with pose, betas, errors and figures.
+
+        Returns
+        -------
+        Path
+            The folder.
+        """
+        folder = Path(folder)
+        write_mesh(folder / "completed.ply", self.completed)
+        write_mesh(folder / "predicted.ply", self.predicted)
+        if self.not_skin is not None:
+            storage.write_json(folder / MASK, np.flatnonzero(self.not_skin).tolist())
+        array_names = ("pose", "betas", "trans", "seen", "expected_error", "confidence", "not_skin")
+        arrays = {name: getattr(self, name) for name in array_names if getattr(self, name) is not None}
+        fact_names = ("rms", "explained", "landmark_rms", "converged", "iterations")
+        facts = {name: getattr(self, name) for name in (*fact_names, "energies", "scale", "soles", "worn")}
+        facts["judgement"] = str(self.judgement)
+        storage.save(folder / "completion.npz", KIND, VERSION, arrays, facts)
+        return folder
 
 
 @dataclass(frozen=True, eq=False)
@@ -168,6 +198,7 @@ class Fitted:
         return find_not_skin(self.result.predicted, self.fit.body, self.cloud, count)
 
 
+@take_any_mesh
 @one_thread()
 def complete(body: BodyModel | Subject, scan: Scan, landmarks: tuple[np.ndarray, np.ndarray] | None = None,
              config: CompletionConfig | None = None, progress: Progress | None = None,
@@ -452,26 +483,6 @@ def completion_problem(done: Completion, points: np.ndarray, free_scale: bool = 
                                 "model?"))
 
 
-def save_completion(folder: str | Path, completion: Completion) -> Path:
-    """Write `completed.ply`, `predicted.ply` and `completion.npz` (arrays and figures) and return the folder.
-
-    Where hair or clothes were found, `mask.json` lists their points, to be corrected. `completion.npz` is written last:
-    where it exists, the meshes do too.
-    """
-    folder = Path(folder)
-    write_mesh(folder / "completed.ply", completion.completed)
-    write_mesh(folder / "predicted.ply", completion.predicted)
-    if completion.not_skin is not None:
-        storage.write_json(folder / MASK, np.flatnonzero(completion.not_skin).tolist())
-    array_names = ("pose", "betas", "trans", "seen", "expected_error", "confidence", "not_skin")
-    arrays = {name: getattr(completion, name) for name in array_names if getattr(completion, name) is not None}
-    fact_names = ("rms", "explained", "landmark_rms", "converged", "iterations")
-    facts = {name: getattr(completion, name) for name in (*fact_names, "energies", "scale", "soles", "worn")}
-    facts["judgement"] = str(completion.judgement)
-    storage.save(folder / "completion.npz", KIND, VERSION, arrays, facts)
-    return folder
-
-
 def load_completion(folder: str | Path) -> Completion:
     """Read the result of `scape complete` from its folder.
 
@@ -492,12 +503,11 @@ def load_completion(folder: str | Path) -> Completion:
 
     Examples
     --------
-    >>> from completion.partial.completion import save_completion
     >>> from scanprep.synthetic.topology import load_topology
     >>> mesh = load_topology().mesh
     >>> seen = np.ones(len(mesh.vertices), dtype=bool)
     >>> result = Completion(mesh, mesh, np.zeros((16, 3)), None, np.zeros(3), seen, 0.001, 0.98, 0.004, True, 12)
-    >>> load_completion(save_completion("completed", result)).iterations
+    >>> load_completion(result.save("completed")).iterations
     12
 
     [SCAPE] §7

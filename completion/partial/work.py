@@ -29,7 +29,7 @@ from scanprep.registration.ground import soles_row
 
 from .clicked_markers import extra_markers, write_clicked_markers
 from .colors import ColorConfig, blend, carry_colors, views_with_colors
-from .completion import Completion, complete, save_completion
+from .completion import Completion, complete
 from .masks import read_mask
 from .report import completion_page, completion_panes, picture_completion
 from .settings import CompletionConfig
@@ -126,7 +126,7 @@ def write_results(work: CompletionTask, inputs: CompletionInputs, files: ScanFil
             write_textured(output / "completed.glb", bake_body_texture(
                 mesh, lambda places, normals: blend(known, places, normals, work.colors), colors))
         done = replace(done, completed=Mesh(mesh.vertices, mesh.faces, colors))
-    save_completion(output, done)
+    done.save(output)
     metrics = [judgement_row(done.judgement), *completion_figures(work, inputs, done, landmarks, masked)]
     # the picture and the page, and a small scene for the page of the folder
     picture = picture_completion(views, done, work.body.template, masked=masked)

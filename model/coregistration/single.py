@@ -7,11 +7,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from scanprep.correspondence.correspondences import check_pairs
-from scanprep.geometry.mesh import Mesh
+from scanprep.geometry.mesh import Mesh, take_any_mesh
 from scanprep.geometry.surface import Surface
 from scanprep.geometry.target import Target, orient_by_mesh, target_of
 from scanprep.registration.nonrigid import register
 from scanprep.threads import one_thread
+from scanprep.words import describe_result
 
 from ..body import BodyModel
 from ..features import twists
@@ -89,8 +90,10 @@ class ModelRegistration:
     inverted: int
     confidence: np.ndarray
     starts: int
+    __repr__ = describe_result
 
 
+@take_any_mesh
 @one_thread()
 def register_with_model(body: BodyModel | Subject, scan: Mesh | np.ndarray, landmarks: Landmarks | None = None,
                         start: np.ndarray | None = None, config: CoregistrationConfig | None = None,

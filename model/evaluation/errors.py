@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from scanprep.judgement import HAND, extent, size, unit_problem
+from scanprep.words import describe_result
 
 from ..body import BodyModel, Progress
 from ..digests import check_bodies
@@ -31,6 +32,9 @@ class Errors:
     by_vertex: np.ndarray
     by_part: np.ndarray
 
+    def __repr__(self) -> str:
+        return f"Errors({1000 * self.overall:.2f} mm on average, {1000 * self.worst.max():.1f} at most)"
+
     @property
     def overall(self) -> float:
         """Mean over bodies and vertices, metres."""
@@ -49,6 +53,7 @@ class PoseErrors:
     trans: np.ndarray
     betas: np.ndarray | None
     converged: np.ndarray
+    __repr__ = describe_result
 
     def vertices(self, model: BodyModel, i: int) -> np.ndarray:
         """Compute the fitted vertices (N, 3) of body i, metres."""
@@ -72,6 +77,7 @@ class ShapeErrors:
     poses: np.ndarray
     trans: np.ndarray
     converged: np.ndarray
+    __repr__ = describe_result
 
     def vertices(self, model: BodyModel, c: int, i: int) -> np.ndarray:
         """Compute the fitted vertices (N, 3) of person i with the c-th number of components, metres."""

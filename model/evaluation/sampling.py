@@ -47,6 +47,11 @@ def sample_bodies(model: BodyModel, count: int, rng: np.random.Generator, pose_t
     sex : {"female", "male"}, optional
         For a model that tells women from men; by default half of its bodies are women.
 
+    Returns
+    -------
+    Samples
+        Betas (n, k), poses (n, J, 3), vertices (n, N, 3) in metres, and sexes.
+
     Raises
     ------
     ValueError

@@ -13,11 +13,12 @@ from scanprep.geometry.farthest_points import farthest_points
 from scanprep.geometry.least_squares import Dense, Minimum, levenberg_marquardt
 from scanprep.ranges import Count, Settings
 from scanprep.threads import one_thread
+from scanprep.words import describe_result
 
 from ..bilinear import PosedPoints, ShapedPoints
 from ..body import BodyModel
 from ..features import twists
-from ..linear import PointOperator, Subject
+from ..linear import PointOperator, Subject, check_subject
 
 
 @dataclass(frozen=True)
@@ -87,6 +88,7 @@ class PoseFit:
     mean: float
     converged: bool
     iterations: int
+    __repr__ = describe_result
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,6 +110,7 @@ class ShapeFit(PoseFit):
     """
 
     betas: np.ndarray
+    __repr__ = describe_result
 
 
 @one_thread()
@@ -149,7 +152,7 @@ class PoseFitter:
     """`fit_pose` for many scans of one subject: what does not depend on the scan is prepared once."""
 
     def __init__(self, subject: Subject, config: FitConfig | None = None) -> None:
-        self.subject, self.config = subject, config or FitConfig()
+        self.subject, self.config = check_subject(subject), config or FitConfig()
         self._chosen = spread_vertices(subject.template.vertices, self.config.sample)
         self._sample = subject.points(self._chosen)
 

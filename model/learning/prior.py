@@ -16,7 +16,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from scanprep.geometry.carrier import mount
-from scanprep.geometry.mesh import Mesh
+from scanprep.geometry.mesh import Mesh, take_any_mesh
 from scanprep.skeleton.tree import Skeleton
 
 from ..body import BodyModel
@@ -48,6 +48,7 @@ class TemplatePrior:
     people: np.ndarray
 
 
+@take_any_mesh
 def bring_prior(model: BodyModel, template: Mesh, progress: Callable[[int, int], None] | None = None) -> TemplatePrior:
     """Bring a known model to a template of any triangles, as the prior of `learn_scape`.
 

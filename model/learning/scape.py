@@ -12,7 +12,7 @@ import numpy as np
 
 from scanprep.batch.pool import SideBySide
 from scanprep.batch.room import Step, run_uncached, substeps
-from scanprep.geometry.mesh import Mesh, check_template
+from scanprep.geometry.mesh import Mesh, check_template, take_any_mesh
 from scanprep.geometry.upright import find_up
 from scanprep.judgement import HAND, Judgement, extent, size, unit_problem
 from scanprep.skeleton.names import skeleton_doubts
@@ -68,6 +68,7 @@ class ProgressShares:
         return value
 
 
+@take_any_mesh
 @one_thread()
 def learn_scape(template: Mesh, poses: np.ndarray, shapes: np.ndarray | None, skeleton: Skeleton,
                 config: LearnConfig | None = None, progress: Progress | None = None, step: Step = run_uncached,
@@ -132,6 +133,7 @@ def learn_scape(template: Mesh, poses: np.ndarray, shapes: np.ndarray | None, sk
                       **_learn_spaces(parts, poses, shapes, config, ProgressShares(progress, step), prior))
 
 
+@take_any_mesh
 @one_thread()
 def learn_blendscape(template: Mesh, poses: np.ndarray, shapes: np.ndarray | None, skeleton: Skeleton,
                      config: LearnConfig | None = None, progress: Progress | None = None, step: Step = run_uncached,

@@ -8,7 +8,7 @@ from operator import itemgetter
 import numpy as np
 
 from scanprep.batch.room import Step, run_uncached
-from scanprep.geometry.mesh import Mesh
+from scanprep.geometry.mesh import Mesh, take_any_mesh
 from scanprep.geometry.upright import find_up
 from scanprep.ranges import Count, Positive, Settings
 from scanprep.skeleton.tree import Skeleton
@@ -60,6 +60,7 @@ class SkinConfig(Settings):
     components: int = 40
 
 
+@take_any_mesh
 @one_thread()
 def learn_skinning(template: Mesh, poses: np.ndarray, shapes: np.ndarray | None, skeleton: Skeleton,
                    config: SkinConfig | None = None, progress: Progress | None = None, step: Step = run_uncached

@@ -10,7 +10,7 @@ from functools import cached_property
 import numpy as np
 
 from scanprep.geometry.geodesics import SurfaceGraph
-from scanprep.geometry.mesh import Mesh
+from scanprep.geometry.mesh import Mesh, take_any_mesh
 
 from .marks import BodyLandmarks, body_landmarks
 from .section import Carried, SectionCurve, direction, mean_of, on_the_way, part_around, section, tape
@@ -25,6 +25,7 @@ class _NotThereError(ValueError):
     """A measurement that cannot be found on a template; the message says why."""
 
 
+@take_any_mesh
 def find_tapes(template: Mesh, landmarks: Mapping[str, int]) -> Tapes:
     """Find every measurement on a template that stands upright, its arms away from the body.
 

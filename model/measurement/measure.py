@@ -7,7 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from scanprep.geometry import rotations
-from scanprep.geometry.mesh import Mesh
+from scanprep.geometry.mesh import Mesh, take_any_mesh
+from scanprep.words import describe_result
 
 from .reading import NotMeasuredError, Reading, Standing, read_measurement
 from .tapes import Tapes
@@ -51,6 +52,7 @@ class Measurements:
     axes: np.ndarray
     errors: Mapping[str, float]
     body: np.ndarray
+    __repr__ = describe_result
 
     @property
     def values(self) -> dict[str, float]:
@@ -58,6 +60,7 @@ class Measurements:
         return {name: reading.value for name, reading in self.readings.items()}
 
 
+@take_any_mesh
 def measure(body: Mesh | np.ndarray, tapes: Tapes, axes: np.ndarray | None = None,
             expected_error: np.ndarray | None = None, only: Iterable[str] | None = None) -> Measurements:
     """Measure a body that has the triangles of a template and stands about as it does.

@@ -13,7 +13,7 @@ from scanprep.geometry.storage import StorageError
 from scanprep.skeleton.roles import find_numbered_roles
 
 from ..body import BodyModel
-from ..linear import Subject
+from ..linear import Subject, check_subject
 from .amass import BODY, UNCERTAIN, moving_body, with_joints
 from .bvh import read_bvh
 from .error import RetargetingError, TwistError, measure_error, measure_twist
@@ -107,7 +107,7 @@ def read_motion(path: str | Path, model: BodyModel, subject: Subject | None = No
     ...     read_motion(f"{folder}/stand.npz", load_built_in_model()).poses.shape
     (5, 16, 3)
     """
-    path = Path(path)
+    path, subject = Path(path), None if subject is None else check_subject(subject)
     if path.suffix.lower() == ".bvh":
         return _onto(path, read_bvh(path, unit or "cm", rate), model, subject)
     J = len(model.skeleton.parents)

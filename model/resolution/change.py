@@ -9,7 +9,7 @@ from scipy.spatial import cKDTree
 from scanprep.decimation.decimate import DecimateConfig, decimate
 from scanprep.geometry.attached import Attached
 from scanprep.geometry.carrier import mount
-from scanprep.geometry.mesh import Mesh, check_template
+from scanprep.geometry.mesh import Mesh, check_template, take_any_mesh
 from scanprep.geometry.surface import Surface
 from scanprep.ranges import Settings
 
@@ -30,6 +30,7 @@ class ResolutionConfig(Settings):
     rounds: int = 2
 
 
+@take_any_mesh
 def change_resolution(model: BodyModel, template: Mesh, config: ResolutionConfig | None = None,
                       progress: Progress | None = None) -> BodyModel:
     """Transfer a model to a coarser or finer triangulation, so that pose, betas and trans keep their meaning.

@@ -10,7 +10,7 @@ from scipy.sparse import csr_array, diags_array
 
 from scanprep.batch.room import Step, run_uncached
 from scanprep.geometry.landmark_names import FACE
-from scanprep.geometry.mesh import Mesh
+from scanprep.geometry.mesh import Mesh, take_any_mesh
 from scanprep.geometry.sanitise import sanitise
 from scanprep.ranges import Settings
 
@@ -92,6 +92,7 @@ class FittedStatue(Statue):
     surface: SurfaceFit | None = None
 
 
+@take_any_mesh
 def fit_statue(scan: Mesh, joints: Mapping[str, np.ndarray] | None = None,
                points: Mapping[str, np.ndarray] | None = None, control: ControlModel | None = None,
                config: StatueConfig | None = None, progress: Progress | None = None, step: Step = run_uncached

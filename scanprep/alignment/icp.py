@@ -7,7 +7,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from ..geometry import rotations
-from ..geometry.mesh import Mesh
+from ..geometry.mesh import Mesh, take_any_mesh
 from ..geometry.surface import check_points
 from ..geometry.target import target_of
 from ..judgement import extent, unit_problem
@@ -79,6 +79,7 @@ def align_landmarks(source: np.ndarray, target: np.ndarray, scale: bool = False)
     return RigidAlignment(T, float(np.sqrt(np.mean(residual**2))), len(source), True, 1)
 
 
+@take_any_mesh
 def align_rigid(source: Mesh | np.ndarray, target: Mesh | np.ndarray,
                 landmarks: tuple[np.ndarray, np.ndarray] | None = None, config: RigidConfig | None = None,
                 start: np.ndarray | None = None) -> RigidAlignment:

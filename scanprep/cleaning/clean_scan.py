@@ -7,10 +7,11 @@ from typing import Annotated
 import numpy as np
 from scipy.spatial import cKDTree
 
-from ..geometry.mesh import Mesh, select_points
+from ..geometry.mesh import Mesh, select_points, take_any_mesh
 from ..geometry.places import spacing
 from ..geometry.sanitise import sanitise
 from ..geometry.sparse import label_components
+from ..judgement import Judgement
 from ..ranges import FLAG, Axis, Settings, direction_of
 from .floor import Plane, find_plane, floor_points
 
@@ -82,6 +83,11 @@ class CleanedScan:
         """The body as a mesh; without triangles if the input was a point cloud."""
         return _as_mesh(self.scan)
 
+    @property
+    def judgement(self) -> Judgement:
+        """Whether the body is alone now: "check" where a pedestal may be left, or a second person was dropped."""
+        return Judgement.of(check=cleaning_doubts(self))
+
 
 def cleaning_doubts(found: CleanedScan) -> list[str]:
     """Explain why a cleaned scan needs a look: a pedestal may be left, and a dropped piece may be a second person."""
@@ -117,6 +123,7 @@ def take_clutter(scan: Mesh | np.ndarray) -> tuple[Mesh | np.ndarray, float]:
     return (cleaned.scan, removed) if 0 < removed <= 0.2 and not second_person(cleaned) else (scan, 0.0)
 
 
+@take_any_mesh
 def clean_scan(scan: Mesh | np.ndarray, config: CleanScanConfig | None = None, landmarks: np.ndarray | None = None,
                rng: np.random.Generator | None = None) -> CleanedScan:
     """Keep the body of a raw scan and drop the floor, walls, furniture and specks.

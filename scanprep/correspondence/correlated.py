@@ -19,7 +19,7 @@ import numpy as np
 
 from ..geometry.farthest_points import farthest_points
 from ..geometry.geodesics import SurfaceGraph
-from ..geometry.mesh import Mesh, check_template
+from ..geometry.mesh import Mesh, check_template, take_any_mesh
 from ..geometry.target import target_of
 from ..threads import one_thread
 from .correspondences import Correspondences, check_pairs
@@ -30,6 +30,7 @@ from .sheet import Sheet
 TRIAL = CorrelatedConfig(points=90, levels=(BeliefLevel(900, 60),), iterations=25)
 
 
+@take_any_mesh
 @one_thread()
 def find_correspondences(template: Mesh, scan: Mesh | np.ndarray, seeds: tuple[np.ndarray, np.ndarray] | None = None,
                          config: CorrelatedConfig | None = None,

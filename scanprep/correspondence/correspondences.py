@@ -13,6 +13,7 @@ import numpy as np
 from ..geometry import storage
 from ..geometry.format_common import FARTHEST
 from ..geometry.mesh import Mesh
+from ..judgement import Judgement
 
 KIND, VERSION = "correspondences", 1
 
@@ -52,6 +53,11 @@ class Correspondences:
 
     def __len__(self) -> int:
         return len(self.template_vertices)
+
+    @property
+    def judgement(self) -> Judgement:
+        """Whether they can be used: whether they mean nothing, and whether limbs may have been confused."""
+        return Judgement.of(correspondences_problem(self), correspondences_doubts(self))
 
 
 def check_pairs(template: Mesh, vertices: np.ndarray, points: np.ndarray, name: str, least: int = 3

@@ -8,7 +8,7 @@ from typing import Annotated, Literal, NamedTuple, get_args
 import numpy as np
 from scipy.spatial import cKDTree
 
-from ..geometry.mesh import Mesh
+from ..geometry.mesh import Mesh, take_any_mesh
 from ..geometry.remeshing import improve_triangles
 from ..geometry.surface import Surface
 from ..ranges import FLAG, Settings
@@ -54,6 +54,7 @@ class Decimation(NamedTuple):
     face_map: np.ndarray        # (f,) the original triangle of every new one
 
 
+@take_any_mesh
 def decimate(mesh: Mesh, faces: int, config: DecimateConfig | None = None, keep: np.ndarray | None = None,
              labels: np.ndarray | None = None, progress: Callable[[int, int], None] | None = None) -> Mesh:
     """Collapse edges until about `faces` triangles are left.

@@ -8,7 +8,7 @@ from typing import Annotated, Any
 import numpy as np
 from scipy.sparse.csgraph import dijkstra
 
-from ..geometry.mesh import Mesh
+from ..geometry.mesh import Mesh, take_any_mesh
 from ..geometry.remeshing import smooth_taubin
 from ..geometry.sparse import unique_integers
 from ..geometry.surface import Rays, barycentric, mesh_and_camera
@@ -79,6 +79,7 @@ class _View:
         return face, (hit - depth) * cosine, weight, bary
 
 
+@take_any_mesh
 def merge_views(views: Sequence[Any], config: MergeConfig | None = None,
                 progress: Callable[[int, int], None] | None = None) -> Mesh:
     """Merge several range views with known cameras into one surface.

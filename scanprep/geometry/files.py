@@ -37,7 +37,7 @@ from .format_common import (
     load_bytes,
     metres_per_unit,
 )
-from .mesh import Mesh
+from .mesh import Mesh, take_any_mesh
 from .sanitise import sanitise
 from .seams import mean_of_merged, seams_closed
 from .thinning import thin_scan
@@ -182,6 +182,7 @@ def _seamless(path: Path, mesh: Mesh) -> Mesh:
     return Mesh(mesh.vertices[first], vertex_of[mesh.faces], colors, vertex_of_file, mesh.up)
 
 
+@take_any_mesh
 def write_mesh(path: str | Path, mesh: Mesh, precision: Precision = "double") -> None:
     """Write a mesh in metres, atomically, in the format of the file's ending.
 

@@ -16,13 +16,14 @@ from .format_common import FARTHEST, UNITS, MeshFileError, load_bytes, metres_of
 from .landmark_names import pair_names
 from .landmark_reading import Entry, entries_of
 from .landmark_writing import encode_landmarks
-from .mesh import Mesh
+from .mesh import Mesh, take_any_mesh
 from .surface import Surface
 
 LANDMARK_ENDINGS = (".landmarks.json", ".json", ".mrk.json", ".pp", "_picked_points.pp", ".lnd", ".landmarks.txt",
                     ".landmarks.csv", ".fcsv", ".scalismo.json")
 
 
+@take_any_mesh
 def read_landmarks(path: str | Path, mesh: Mesh | np.ndarray | None = None, unit: str | None = None
                    ) -> dict[str, np.ndarray]:
     """Read named points.
@@ -64,6 +65,7 @@ def read_landmarks(path: str | Path, mesh: Mesh | np.ndarray | None = None, unit
     return {name: _place(path, name, value, mesh) for name, value in _entries(path, mesh, unit).items()}
 
 
+@take_any_mesh
 def read_landmark_vertices(path: str | Path, mesh: Mesh, unit: str | None = None) -> dict[str, int]:
     """Read named vertices of a mesh from any file of `read_landmarks`.
 

@@ -1,9 +1,11 @@
 """The triangle mesh that all stages use."""
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cached_property
-from typing import Any
+from functools import cached_property, wraps
+from importlib import import_module
+from typing import Any, TypeVar, cast
 
 import numpy as np
 from scipy.sparse import coo_array, csr_array
@@ -83,6 +85,52 @@ class Mesh:
 
     def __repr__(self) -> str:
         return f"Mesh({len(self.vertices)} vertices, {len(self.faces)} faces)"
+
+    @staticmethod
+    def of(mesh: Any) -> Mesh:
+        """Take a mesh of trimesh, pyvista or Open3D as it is; ours comes back itself.
+
+        Parameters
+        ----------
+        mesh : Mesh, trimesh.Trimesh, pyvista.PolyData or open3d.geometry.TriangleMesh
+            In metres. Polygons of pyvista are cut into triangles.
+
+        Raises
+        ------
+        TypeError
+            Something else.
+        """
+        taken = take_mesh(mesh)
+        if not isinstance(taken, Mesh):
+            raise TypeError(f"mesh: expected a mesh of scanprep, trimesh, pyvista or Open3D, got {type(mesh).__name__}")
+        return taken
+
+    def to_trimesh(self) -> Any:
+        """Make a `trimesh.Trimesh` with the same vertices and triangles."""
+        colors = None if self.colors is None else np.round(255 * self.colors).astype(np.uint8)
+        return import_module("trimesh").Trimesh(self.vertices, self.faces, vertex_colors=colors, process=False)
+
+    def to_pyvista(self) -> Any:
+        """Make a `pyvista.PolyData`; colours are its point data "colors"."""
+        mesh = import_module("pyvista").PolyData.from_regular_faces(self.vertices, self.faces)
+        if self.colors is not None:
+            mesh.point_data["colors"] = self.colors
+        return mesh
+
+    def to_open3d(self) -> Any:
+        """Make an `open3d.geometry.TriangleMesh`."""
+        o3d = import_module("open3d")
+        # copies, as Open3D needs arrays of its own
+        mesh = o3d.geometry.TriangleMesh(o3d.utility.Vector3dVector(np.array(self.vertices)),
+                                         o3d.utility.Vector3iVector(self.faces.astype(np.int32)))
+        if self.colors is not None:
+            mesh.vertex_colors = o3d.utility.Vector3dVector(np.array(self.colors))
+        return mesh
+
+    @cached_property
+    def bounds(self) -> np.ndarray:
+        """(2, 3) lower and upper corner of the box around the vertices, metres."""
+        return np.stack([self.vertices.min(axis=0), self.vertices.max(axis=0)])
 
     def with_vertices(self, vertices: np.ndarray, up: int | None = None) -> Mesh:
         """Return a mesh with the same triangles and other vertices (N, 3), metres; `up` is their axis, where known."""
@@ -258,6 +306,41 @@ class Mesh:
         s = rng.random(count)
         bary = np.stack([1 - r, r * (1 - s), r * s], axis=1)
         return np.einsum("nc,ncd->nd", bary, self.corners[face]), face, bary
+
+
+def take_mesh(what: Any) -> Any:
+    """Return a mesh of trimesh, pyvista or Open3D as `Mesh`, in lists and tuples too; anything else as it is.
+
+    They are known by what they have: vertices and faces, points and faces, or vertices and triangles.
+    """
+    if type(what) in (list, tuple):
+        taken = [take_mesh(part) for part in what]
+        return type(what)(taken) if any(a is not b for a, b in zip(taken, what, strict=True)) else what
+    if isinstance(what, Mesh | np.ndarray | str | type):
+        return what
+    points = next((getattr(what, name) for name in ("vertices", "points") if hasattr(what, name)), None)
+    faces = next((getattr(what, name) for name in ("faces", "triangles") if hasattr(what, name)), None)
+    if points is None or faces is None or callable(points) or callable(faces):
+        return what
+    if hasattr(what, "triangulate") and np.ndim(faces) == 1:         # pyvista: 3, a, b, c, 3, a, b, c, ...
+        faces = np.asarray(what.triangulate().faces).reshape(-1, 4)[:, 1:]
+    # colours of the vertices, of Open3D from 0 to 1, of trimesh from 0 to 255
+    colors = np.asarray(getattr(what, "vertex_colors", ()), dtype=float)
+    if getattr(getattr(what, "visual", None), "kind", None) == "vertex":
+        colors = np.asarray(what.visual.vertex_colors)[:, :3] / 255
+    return Mesh(np.asarray(points), np.asarray(faces), colors if len(colors) and len(colors) == len(points) else None)
+
+
+F = TypeVar("F", bound=Callable[..., Any])
+
+
+def take_any_mesh(function: F) -> F:
+    """Decorate a public function, so that it takes meshes of trimesh, pyvista and Open3D where it takes ours."""
+    @wraps(function)
+    def wrapper(*args: Any, **named: Any) -> Any:
+        return function(*take_mesh(args), **{name: take_mesh(value) for name, value in named.items()})
+
+    return cast(F, wrapper)
 
 
 def template_problem(mesh: Mesh) -> str | None:

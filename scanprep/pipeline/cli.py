@@ -22,9 +22,9 @@ from ..dataset import RegisteredSet
 from ..geometry.mesh import Mesh
 from ..registration.figures import Limits, Verdict
 from ..skeleton.names import note_numbered_parts
-from .again import LISTED, Call
+from .again import LISTED, Call, prepare_set
 from .page import PAGE, judge_set, judge_whole, write_set_page
-from .prepare import PrepareConfig, Prepared, Progress, prepare
+from .prepare import PrepareConfig, Prepared, Progress
 from .scans import ScanTask
 
 ScansArg = Annotated[Path, Place("SCANS")]
@@ -68,18 +68,12 @@ def carry_out(call: Call, inputs: tuple[list[ScanTask], Mesh, dict[str, int]], s
 
     `progress` are up to four callbacks: scans, skeleton, parts of a person, and the steps inside one scan.
     """
-    tasks, template, landmarks = inputs
-    prepared = prepare(tasks, template, landmarks, space.folder, call.config, *progress)
-    with space.staging("run") as staged:
-        call.write(staged.folder)
-    return summarize(call, len(tasks), prepared, space)
+    return summarize(call, len(inputs[0]), prepare_set(call, inputs, space, *progress), space)
 
 
 def summarize(call: Call, count: int, prepared: Prepared, space: Workspace) -> Outcome:
     """Build the outcome of the command: figures of the set, failures, judgement and next step."""
     verdicts, tree = judge_set(space.folder), prepared.registered.skeleton
-    # a skeleton that was edited is as its user wants it
-    parts = call.config.skeleton.parts if space.is_ours("skeleton.json") else None
     if tree is not None:
         note_numbered_parts(tree)
     seconds = [f.seconds for f in prepared.figures if np.isfinite(f.seconds)]
@@ -92,7 +86,7 @@ def summarize(call: Call, count: int, prepared: Prepared, space: Workspace) -> O
             Metric("parts of the skeleton", len(tree.parents) if tree else "none sought"),
             *_quality(verdicts), Metric("unit assumed", call.config.scan.unit or "m")]
     return Outcome(space.folder, rows, {"prepare": call.config}, list(prepared.failures),
-                   judgement=judge_whole(verdicts, tree, parts=parts),
+                   judgement=judge_whole(verdicts, tree, parts=prepared.parts),
                    scans={verdict.name: verdict.judgement for verdict in verdicts},
                    following=f"open {quote(str(space.folder / 'report.html'))}, then "
                    f"scape learn --poses {quote(str(space.folder))} --shapes {quote(str(space.folder))} -o model.npz")

@@ -18,6 +18,7 @@ from ..batch.workspace import Task, Workspace
 from ..dataset import RegisteredSet, SetEntry, read_entries, write_set
 from ..geometry.landmarks import write_landmarks
 from ..geometry.mesh import Mesh, check_template
+from ..judgement import Judgement
 from ..judgement import size as size_of
 from ..ranges import Count, Settings
 from ..registration.figures import ScanFigures, read_failures, review, write_doubts, write_failures, write_figures
@@ -27,8 +28,9 @@ from ..registration.schedule import RegistrationConfig
 from ..skeleton.find import find_skeleton
 from ..skeleton.parts import SkeletonConfig
 from ..threads import one_thread
+from ..words import describe_result
 from .bootstrap import bootstrap_set, drop_rounds, find_better_scans
-from .page import PICTURES, write_set_page
+from .page import PICTURES, judge_set, judge_whole, write_set_page
 from .rivals import RIVALS, TWO_BODIES, doubt_rivals, has_rival, load_figures, rival_file, save_figures
 from .scan import RegisterScan, ScanSettings, mesh_file
 from .scans import ScanTask
@@ -75,6 +77,13 @@ class Prepared:
     figures: tuple[ScanFigures, ...]    # of all scans in the set
     failures: tuple[str, ...]           # one line a scan that could not be registered: which file, and why
     fresh: int = 0                      # scans that were registered now; the others had been before
+    parts: int | None = None            # that the skeleton was to have
+    __repr__ = describe_result
+
+    @property
+    def judgement(self) -> Judgement:
+        """The verdict on the whole set; `set.csv` and the page have that on each scan."""
+        return judge_whole(judge_set(self.registered.folder), self.registered.skeleton, parts=self.parts)
 
 
 def prepare(tasks: Sequence[ScanTask], template: Mesh, template_landmarks: Mapping[str, int], folder: str | Path,
@@ -137,7 +146,7 @@ def prepare(tasks: Sequence[ScanTask], template: Mesh, template_landmarks: Mappi
             _write_skeleton(space, config, skeleton_progress)
         finally:
             # also after an error or Ctrl-C: tables and page show what is finished
-            prepared = _write_all(space, work, tasks, failures, len(fresh))
+            prepared = _write_all(space, work, tasks, failures, len(fresh), config.skeleton.parts)
     return prepared
 
 
@@ -174,7 +183,7 @@ def take_rival(tasks: Sequence[ScanTask], template: Mesh, template_landmarks: Ma
             save_figures(staged.folder, replace(former_figures, doubts=doubts, seconds=np.nan), chosen=True)
             staged.value = replace(rival, seconds=former_figures.seconds)
         drop_rounds(space, name)               # the choice replaces registrations of later rounds
-        return _write_all(space, work, tasks, read_failures(space.folder), 0)
+        return _write_all(space, work, tasks, read_failures(space.folder), 0, config.skeleton.parts)
 
 
 def _set_up(space: Workspace, tasks: Sequence[ScanTask], template: Mesh, template_landmarks: Mapping[str, int],
@@ -198,13 +207,15 @@ def name_model(tasks: Sequence[ScanTask], config: PrepareConfig) -> list[ScanTas
 
 
 def _write_all(space: Workspace, work: RegisterScan, tasks: Sequence[ScanTask], failures: Mapping[str, str],
-               fresh: int) -> Prepared:
+               fresh: int, parts: int | None) -> Prepared:
     """Write the tables and the page of a set; return what is in it."""
     figures = _write_tables(space, work, tasks, failures)
     with space.staging("page") as staged:
         write_set_page(space.folder, to=staged.folder)
     return Prepared(RegisteredSet.load(space.folder), tuple(figures[name] for name in sorted(figures)),
-                    tuple(failures[name] for name in sorted(failures)), fresh)
+                    tuple(failures[name] for name in sorted(failures)), fresh,
+                    # a skeleton that was edited is as its user wants it
+                    parts if space.is_ours("skeleton.json") else None)
 
 
 def _lead(space: Workspace, template: Mesh, tasks: Sequence[ScanTask], through: str, progress: Progress | None

@@ -1,7 +1,6 @@
 """`scape prep align`, `correspond` and `register`: one mesh onto another."""
 from __future__ import annotations
 
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
 
@@ -13,12 +12,7 @@ from ..cleaning.clean_scan import take_clutter
 from ..cli import MM, MeshArg, Output, PersonUnit, ScanArg, Unit
 from ..console import Metric, Outcome, bar
 from ..correspondence.correlated import find_correspondences
-from ..correspondence.correspondences import (
-    correspondences_doubts,
-    correspondences_problem,
-    read_correspondences,
-    write_correspondences,
-)
+from ..correspondence.correspondences import read_correspondences, write_correspondences
 from ..correspondence.search import CorrelatedConfig
 from ..geometry.files import read_mesh, read_scan, write_mesh
 from ..geometry.landmarks import (
@@ -29,17 +23,17 @@ from ..geometry.landmarks import (
     try_match_landmarks,
 )
 from ..geometry.mesh import Mesh
-from ..judgement import Judgement, check_unit, implausible_body, size
-from .figures import ONE_VIEW, UNSEEN, figures_of, review
+from ..judgement import Judgement, check_unit
 from .ground import soles_row, with_soles
 from .lead import lead_of
-from .limbs import find_exchanged_sides, hidden_doubts, limb_doubts
-from .nonrigid import LedRegistration, Registration, register, registration_problem
-from .person import PersonParts, person_parts, stature
+from .matches import Landmarks
+from .nonrigid import LedRegistration, register
+from .person import person_parts
 from .repair import repair_limbs
 from .schedule import RegistrationConfig
 from .unit import resolve_unit
-from .unmarked import FEW, RIVAL, doubt_worn, register_by_any
+from .unmarked import FEW, register_by_any
+from .verdict import judge_registration
 
 
 def align(source: MeshArg, target: Annotated[Path, Place("TARGET")], output: Output, landmarks: Path | None = None,
@@ -121,7 +115,7 @@ def correspond(scan: ScanArg, template: Path, output: Output, landmarks: Path | 
         Metric("method", pairs_found.method), *led_by, Metric("correspondences", len(pairs_found)),
         Metric("confidence, median", float(np.median(pairs_found.confidence))),
         Metric("converged", str(pairs_found.converged))], {"correspond": config},
-                   judgement=Judgement.of(correspondences_problem(pairs_found), correspondences_doubts(pairs_found)))
+                   judgement=pairs_found.judgement)
 
 
 def register_one(scan: ScanArg, template: Path, output: Output, landmarks: Path | None = None,
@@ -190,28 +184,3 @@ def register_one(scan: ScanArg, template: Path, output: Output, landmarks: Path 
         *soles_row(fit.soles),
         Metric("converged", str(fit.converged))], {"register": config},
                    judgement=judge_registration(scan.name, body, data, fit, pairs, parts, rival is not None, worn))
-
-
-Landmarks = tuple[np.ndarray, np.ndarray]
-
-
-def judge_registration(name: str, template: Mesh, scan: Mesh | np.ndarray, fit: Registration, pairs: Landmarks | None,
-                       parts: PersonParts | None, has_rival: bool = False, worn: Sequence[str] = ()) -> Judgement:
-    """Judge the registration of one scan by the limits used for sets, and by whether it is a plausible person.
-
-    `has_rival` says whether another body explains the scan about as well; `worn` are hair and clothes, in words.
-    """
-    # first what makes the registration meaningless, then what only needs a look
-    problem = registration_problem(template, scan, fit, pairs is not None) or (
-        find_exchanged_sides(template, parts, fit.mesh.vertices) if parts else None)
-    doubts = (*limb_doubts(template, parts, fit.mesh.vertices), *hidden_doubts(parts, fit.mesh, fit.seen),
-              *doubt_worn(worn)) \
-        if parts else ()
-    verdict = review([figures_of(name, "", template, fit)], {} if problem is None else {name: problem}, size(template),
-                     len(template.faces), doubts={name: doubts} if parts else None,
-                     usual=ONE_VIEW if parts else UNSEEN)[0]
-    rival = Judgement.of(check=[f"{RIVAL}: click some landmarks, left and right, to decide"] if has_rival else [])
-    if parts is None or problem is not None:
-        return verdict.judgement.merge(rival)
-    # an implausible stature comes first: it is often the cause of implausible limbs
-    return implausible_body(stature(template, parts, fit.mesh.vertices)).merge(verdict.judgement, rival)

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import wraps
+from functools import cached_property, wraps
 from typing import Any, Protocol, TypeVar, cast
 
 import numpy as np
@@ -22,8 +22,9 @@ from ..geometry.mesh import Mesh
 from ..geometry.places import point_areas
 from ..geometry.surface import OrientedPoints, Surface, check_points
 from ..geometry.target import Target, orient_by_mesh
-from ..judgement import HAND, extent, size, unit_problem
+from ..judgement import HAND, UNJUDGED, Judgement, extent, size, unit_problem
 from ..threads import one_thread
+from ..words import describe_result
 from .final_fit import final_fit
 from .folds import find_inverted_triangles, without_inverted
 from .graph_fit import register_graph
@@ -64,6 +65,8 @@ class Registration:
         Limbs were re-rolled by `repair_limbs`.
     soles : (float, float), metres, or None
         How far soles were beyond the end of the scan, before and after `with_soles`.
+    judge : callable, optional
+        Gives the `judgement`, which is made when it is first asked for.
 
     Examples
     --------
@@ -88,6 +91,13 @@ class Registration:
     uncovered: float
     rolled: bool = False
     soles: tuple[float, float] | None = None
+    judge: Callable[[Registration], Judgement] | None = None
+    __repr__ = describe_result
+
+    @cached_property
+    def judgement(self) -> Judgement:
+        """The verdict of `scape prep register`; on a person, whose parts are found first, it takes some seconds."""
+        return UNJUDGED if self.judge is None else self.judge(self)
 
     @property
     def measured(self) -> float:

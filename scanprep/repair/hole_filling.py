@@ -7,7 +7,7 @@ from typing import Annotated, Any, Literal, NamedTuple, get_args
 
 import numpy as np
 
-from ..geometry.mesh import Mesh, template_problem
+from ..geometry.mesh import Mesh, take_any_mesh, template_problem
 from ..geometry.surface import Rays, SeenSpace, Surface
 from ..judgement import Judgement
 from ..ranges import Count, Positive, Range, Settings
@@ -83,6 +83,7 @@ class FillReport:
     holes: tuple[FilledHole, ...]           # longest border first
 
 
+@take_any_mesh
 def fill_holes(mesh: Mesh, config: FillConfig | None = None,
                progress: Callable[[int, int], None] | None = None) -> Mesh:
     """Close the holes of a mesh.

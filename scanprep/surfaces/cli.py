@@ -9,7 +9,7 @@ import numpy as np
 
 from ..alignment.views import AlignViewsConfig, align_views, views_doubts, views_problem
 from ..arguments import Called, Place, UsageError
-from ..cleaning.clean_scan import CleanScanConfig, clean_scan, cleaning_doubts
+from ..cleaning.clean_scan import CleanScanConfig, clean_scan
 from ..cli import MM, MeshArg, Output, PersonUnit, ScanArg, Unit, about_mesh
 from ..console import Metric, Outcome, bar
 from ..dataset import RegisteredSet
@@ -42,7 +42,7 @@ from ..repair.hole_filling import FillConfig, FilledHole, fill_holes, fill_repor
 from ..repair.manifold import repair
 from ..words import number_of
 from .cloud import read_sound_surface
-from .template import carry_landmarks, make_template, template_of_scan, views_without_cameras
+from .template import carry_landmarks, template_of_scan, template_of_views, views_without_cameras
 
 ScansArg = Annotated[tuple[Path, ...], Place("SCAN ...")]
 ViewsArg = Annotated[Path, Place("VIEWS")]
@@ -74,7 +74,7 @@ def template(scans: ScansArg, output: Output, faces: Faces = 14000, landmarks: P
     if len(scans) == 1 and (scans[0] / "cameras.json").exists():
         seen = _read_views(scans[0], resolve_unit(list_meshes(scans[0])[0], unit))
         with bar("making the template") as progress:
-            made = make_template(seen, faces, progress=progress)
+            made = template_of_views(seen, faces, progress=progress)
         rows = [Metric("views", len(seen))]
     else:
         paths = [path for given in scans for path in ([given] if not given.is_dir() else list_files(
@@ -171,7 +171,7 @@ def clean(scan: ScanArg, output: Output, landmarks: Path | None = None, unit: Pe
     return Outcome(output, [
         Metric("points before", len(found.kept)), Metric("points", int(found.kept.sum())),
         *(Metric(f"{why}, {len(points)} pieces" if len(points) > 1 else why, sum(points), "points")
-          for why, points in pieces.items())], {"clean": config}, judgement=Judgement.of(check=cleaning_doubts(found)))
+          for why, points in pieces.items())], {"clean": config}, judgement=found.judgement)
 
 
 def align_cameras(views: ViewsArg, output: Output, landmarks: Path | None = None,

@@ -13,17 +13,19 @@ from ..cleaning.clean_scan import clean_scan
 from ..decimation.decimate import DecimateConfig, decimate
 from ..fusion.tsdf import MergeConfig, merge_views
 from ..geometry.files import PointCloud
-from ..geometry.mesh import Mesh, check_template, template_problem
+from ..geometry.mesh import Mesh, check_template, take_any_mesh, template_problem
 from ..geometry.remeshing import improve_triangles, smooth_taubin
 from ..geometry.surface import Surface
+from ..judgement import Judgement
 from ..ranges import Settings
+from ..registration.lead import find_scanned_person
 from ..registration.nonrigid import share_uncovered
 from ..repair.graft import graft
 from ..repair.handles import count_handles, cut_handles
 from ..repair.hole_filling import FillConfig, close
 from ..repair.manifold import drop_thin, repair
 from ..skeleton.symmetry import find_symmetry
-from ..words import number_of
+from ..words import describe_result, number_of
 from .cloud import AWAY, mesh_of_cloud, mesh_of_view
 
 LOST = 0.008                         # metres: what is farther off a template was lost, half the thickness of a finger
@@ -31,7 +33,7 @@ LOST = 0.008                         # metres: what is farther off a template wa
 
 @dataclass(frozen=True)
 class TemplateConfig(Settings):
-    """Settings of `make_template`.
+    """Settings of a template.
 
     Attributes
     ----------
@@ -51,8 +53,8 @@ class TemplateConfig(Settings):
     thinnest: float = 0.007
 
 
-def make_template(views: Sequence[Any], faces: int = 14000, config: TemplateConfig | None = None,
-                  progress: Callable[[int, int], None] | None = None) -> Mesh:
+def template_of_views(views: Sequence[Any], faces: int = 14000, config: TemplateConfig | None = None,
+                      progress: Callable[[int, int], None] | None = None) -> Mesh:
     """Make a closed manifold mesh from range views of one subject: merge, repair, smooth, fill, decimate.
 
     Views are RangeViews or pairs of a Mesh and a camera position (3,). ValueError if the result cannot serve as a
@@ -72,6 +74,13 @@ class MadeTemplate:
     handles: int                        # topological handles, as between thighs that touch
     balance: float | None               # share of the triangles on the left side; None without symmetry
     lost: float = 0.0                   # share of the scanned surface that is more than 8 mm off the template
+    landmarks: dict[str, int] = field(default_factory=dict)         # name -> vertex, where a person was found
+    __repr__ = describe_result
+
+    @property
+    def judgement(self) -> Judgement:
+        """Whether scans can be registered with it."""
+        return Judgement.of(check=self.doubts)
 
     @property
     def doubts(self) -> list[str]:
@@ -84,6 +93,59 @@ class MadeTemplate:
                 *([f"the surface is joined to itself in {number_of(self.handles, 'place')}: thighs, armpits or "
                    "fingers that touch"]
                   if self.handles else [])]
+
+
+@take_any_mesh
+def make_template(scans: Mesh | PointCloud | Sequence[Mesh | PointCloud], faces: int = 14000,
+                  config: TemplateConfig | None = None, progress: Callable[[int, int], None] | None = None
+                  ) -> MadeTemplate:
+    """Make the template of all registrations from your best scan, as `scape prep template` does.
+
+    The body is taken alone, repaired, its holes filled, and decimated. Where the built-in people come to lie on it, it
+    gets their landmarks, and what the scan lacks, such as finger tips.
+
+    Parameters
+    ----------
+    scans : Mesh or PointCloud, metres, or a sequence of these
+        One scan of the whole body; or views of one moment, which are aligned and merged.
+    faces : int
+        Triangles of the template.
+    config : TemplateConfig, optional
+        Settings.
+    progress : callable, optional
+        Called as progress(done, total).
+
+    Returns
+    -------
+    MadeTemplate
+        The `mesh`, its `landmarks`, `notes` on how it was made, and a `judgement`.
+
+    Raises
+    ------
+    ValueError
+        The result cannot serve as a template, or views do not overlap.
+
+    Examples
+    --------
+    >>> from scanprep import Mesh
+    >>> t, p = np.meshgrid(np.linspace(0, np.pi, 30), np.linspace(0, 2 * np.pi, 61)[:-1], indexing="ij")
+    >>> ball = np.stack([np.sin(t) * np.cos(p), np.sin(t) * np.sin(p), np.cos(t)], axis=-1).reshape(-1, 3)
+    >>> a = (np.arange(29)[:, None] * 60 + np.arange(60)).ravel()
+    >>> b = (np.arange(29)[:, None] * 60 + (np.arange(60) + 1) % 60).ravel()
+    >>> scan = Mesh(ball, np.concatenate([np.stack([a, a + 60, b], 1), np.stack([b, a + 60, b + 60], 1)]))
+    >>> made = make_template(scan, 500)
+    >>> made.mesh.is_closed, len(made.mesh.faces)
+    (True, 500)
+
+    [Liepa], [QEM]
+    """
+    scan = scans if isinstance(scans, Mesh | PointCloud) else views_without_cameras(scans)
+    person = find_scanned_person(scan.vertices if isinstance(scan, Mesh) else scan.points)
+    if person is None:
+        return template_of_scan(scan, faces, config, progress=progress)
+    body, named = person
+    made = template_of_scan(scan, faces, config, progress=progress, person=body)
+    return replace(made, landmarks=carry_landmarks({name: body.vertices[v] for name, v in named.items()}, made.mesh)[0])
 
 
 def template_of_scan(scan: Mesh | PointCloud, faces: int = 14000, config: TemplateConfig | None = None,

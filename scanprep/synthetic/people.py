@@ -33,6 +33,12 @@ class SyntheticPerson:
     ----------
     shape : BodyShape, optional
         By default the average man.
+
+    Examples
+    --------
+    >>> person = SyntheticPerson()
+    >>> person.in_pose(np.zeros((16, 3))).shape == person.mesh.vertices.shape
+    True
     """
 
     parents = PARENTS

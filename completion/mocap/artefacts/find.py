@@ -59,8 +59,8 @@ def find_artefacts(subject: Subject, markers: MarkerSequence, layout: MarkerLayo
     >>> from completion import load_layout
     >>> from model import load_built_in_model
     >>> model = load_built_in_model()
-    >>> layout = load_layout("cmu41", model.template, np.array(model.info["people_vertices"]))
-    >>> still = MarkerSequence(np.stack([layout.place(model.template)] * 5), layout.labels, 120.0)
+    >>> layout = load_layout("cmu41", model)
+    >>> still = MarkerSequence(np.stack([layout.place(model)] * 5), layout.labels, 120.0)
     >>> find_artefacts(model.subject(), still, layout).swaps
     ()
 

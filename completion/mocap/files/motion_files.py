@@ -1,9 +1,10 @@
 """Output files of a motion: tables of joint angles, joint centres and residuals, BVH and GLB."""
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -11,7 +12,7 @@ from model.export.bvh import write_bvh
 from model.export.conventions import aim_bones
 from model.export.correctives import body_correctives, motion_correctives, off_exact
 from model.export.glb import write_skinned_glb
-from model.linear import Subject
+from model.linear import Subject, check_subject
 from model.motion.files import skeleton_arrays
 from model.rig import subject_rig
 from scanprep.console import Metric, details
@@ -20,36 +21,51 @@ from scanprep.geometry.farthest_points import spread_indices
 from scanprep.pictures.camera import guess_upright
 
 from ...motion import Motion
-from ..joint_angles import NOTHING_KNOWN, JointAngles, Known
+from ..joint_angles import NOTHING_KNOWN, JointAngles, Known, as_table
 from .markers import MarkerSequence
 from .opensim import mask_unknown_centres, write_opensim
 
 KEYS = 240                           # frames of a GLB whose bodies are made one by one, where the shape changes
 
 
-def joint_angles(motion: Motion) -> np.ndarray:
-    """Compute rotation vectors of every part relative to its parent, of the root in the world.
+def joint_angles(motion: Motion, subject: Subject) -> Any:
+    """Compute the rotation of every part relative to its parent as a table of named columns, for any kind of body.
 
-    The direction of a vector is the axis, in the axes of the template at rest; its length is the angle. Of the vectors
-    of one rotation, the nearest to the frame before is taken, so there are no jumps of a full turn.
+    It holds rotation vectors, of the root in the world: the direction is the axis, in the axes of the template at rest,
+    the length is the angle. Anatomical angles of people, by ISB, are in `angle_table`.
 
     Parameters
     ----------
     motion : Motion
         Poses (T, J, 3) in radians.
+    subject : Subject
+        The body that moves.
 
     Returns
     -------
-    (T, J, 3) float, degrees
+    pandas.DataFrame, or {str: (T,) float} where pandas is not installed
+        The columns of `joint_angles.csv`: "time" in seconds, then degrees, such as "forearm_left_rx".
 
     Examples
     --------
+    >>> from model import load_built_in_model
     >>> still = Motion(np.full((2, 16, 3), 0.1), np.zeros((2, 3)), None, 120.0, np.zeros((2, 0)))
-    >>> float(joint_angles(still)[1, 0, 0].round(2))
+    >>> float(joint_angles(still, load_built_in_model().subject())["head_rx"][1].round(2))
     5.73
 
     [SCAPE] §8
     """
+    return as_table(angle_columns(motion, check_subject(subject).skeleton.names, rotation_vectors(motion)))
+
+
+def angle_columns(motion: Motion, names: Sequence[str], angles: np.ndarray) -> dict[str, np.ndarray]:
+    """Name the columns of rotation vectors (T, J, 3) of parts; the first is the time, seconds."""
+    named = {f"{name}_r{axis}": angles[:, j, k] for j, name in enumerate(names) for k, axis in enumerate("xyz")}
+    return {"time": motion.times, **named}
+
+
+def rotation_vectors(motion: Motion) -> np.ndarray:
+    """Compute rotation vectors (T, J, 3), degrees; of those of one rotation the nearest to the frame before."""
     turns = motion.poses.copy()
     for t in range(1, len(turns)):
         # add full turns about the axis until it is nearest to the frame before
@@ -85,7 +101,7 @@ def joint_centres(motion: Motion, subject: Subject) -> np.ndarray:
 
     [SCAPE] §4.2
     """
-    return subject.joints(motion.poses, motion.trans)
+    return check_subject(subject).joints(motion.poses, motion.trans)
 
 
 def write_motion_folder(folder: Path, motion: Motion, subject: Subject, markers: MarkerSequence | None = None,
@@ -96,13 +112,13 @@ def write_motion_folder(folder: Path, motion: Motion, subject: Subject, markers:
     markers do not determine are empty cells. Returned are the angles of the MOT.
     """
     skeleton, T, centres = subject.skeleton, len(motion.poses), joint_centres(motion, subject)
-    names, angles = skeleton.names, joint_angles(motion)
+    names, angles = skeleton.names, rotation_vectors(motion)
     if (told := known.told) is not None:
         angles[~(told & told[:, np.maximum(skeleton.parents, 0)])] = np.nan     # unknown if either side is
     motion.save(folder / "motion.npz", **skeleton_arrays(subject.rest_skeleton))
     write_motion_bvh(folder / "motion.bvh", motion, subject)
-    write_numbers(folder / "joint_angles.csv", ["time", *(f"{name}_r{axis}" for name in names for axis in "xyz")],
-                  np.c_[motion.times, angles.reshape(T, -1)])
+    columns = angle_columns(motion, names, angles)
+    write_numbers(folder / "joint_angles.csv", list(columns), np.column_stack(list(columns.values())))
     write_numbers(folder / "joint_centres.csv", ["time", *(f"{name}_{axis}" for name in names for axis in "xyz")],
                   np.c_[motion.times, mask_unknown_centres(centres, skeleton, told).reshape(T, -1)])
     anatomical = write_opensim(folder, motion, subject, centres, markers, known)

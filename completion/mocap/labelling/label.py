@@ -128,7 +128,7 @@ def label_markers(model: BodyModel | Subject, points: MarkerSequence, layout: Ma
     >>> from completion import load_layout
     >>> from model import load_built_in_model
     >>> model = load_built_in_model()
-    >>> layout = load_layout("cmu41", model.template, np.array(model.info["people_vertices"]))
+    >>> layout = load_layout("cmu41", model)
     >>> raw = MarkerSequence(np.stack([layout.place(model.template)[::-1]] * 2), [f"*{i}" for i in range(41)], 120.0)
     >>> label_markers(model.subject(), raw, layout).columns[0].tolist() == list(range(41))[::-1]
     True
@@ -171,7 +171,7 @@ def label_people(people: Sequence[tuple[BodyModel | Subject, MarkerLayout]], poi
     >>> from completion import load_layout
     >>> from model import load_built_in_model
     >>> model = load_built_in_model()
-    >>> layout = load_layout("cmu41", model.template, np.array(model.info["people_vertices"]))
+    >>> layout = load_layout("cmu41", model)
     >>> raw = MarkerSequence(np.stack([layout.place(model.template)] * 2), layout.labels, 120.0)
     >>> [one.columns.shape for one in label_people([(model.subject(), layout)], raw)]
     [(2, 41)]

@@ -74,7 +74,7 @@ class LabelStream:
     >>> from completion import load_layout
     >>> from model import load_built_in_model
     >>> model = load_built_in_model()
-    >>> layout = load_layout("cmu41", model.template, np.array(model.info["people_vertices"]))
+    >>> layout = load_layout("cmu41", model)
     >>> stream = LabelStream(model.subject(), layout, 120.0)
     >>> frame = stream.push(layout.place(model.template)[::-1])         # (N, 3), metres, in any order
     >>> frame.found, frame.columns[:3].tolist()

@@ -136,7 +136,7 @@ def design_markers(model: BodyModel, bodies: np.ndarray, candidates: MarkerLayou
     >>> from completion.mocap.marker_selection.fits import DesignConfig
     >>> from model import load_built_in_model
     >>> model = load_built_in_model()
-    >>> among = load_layout("cmu41", model.template, np.array(model.info["people_vertices"]))
+    >>> among = load_layout("cmu41", model)
     >>> bodies = np.stack([model.vertices(model.pose_mean, betas) for betas in np.eye(2)])
     >>> quick = DesignConfig(count=6, n_betas=2, surface=100, exchanges=0)
     >>> len(design_markers(model, bodies, among, quick).layout.labels)

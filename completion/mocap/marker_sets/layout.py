@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from model.body import BodyModel
 from scanprep.geometry import storage
 from scanprep.geometry.mesh import Mesh
 
@@ -271,11 +272,12 @@ class MarkerLayout:
                 weights[row] = [1.0, 0.0, 0.0]
         return replace(self, vertices=vertices, weights=weights)
 
-    def place(self, mesh: Mesh) -> np.ndarray:
+    def place(self, mesh: Mesh | BodyModel) -> np.ndarray:
         """Compute the positions (L, 3), metres, of the markers on a body: points of the skin, moved along the normal.
 
-        The normal is that of the vertex or of the triangle on which a marker sits.
+        The normal is that of the vertex or of the triangle on which a marker sits. Of a model it is the template.
         """
+        mesh = mesh.template if isinstance(mesh, BodyModel) else mesh
         self._check(len(mesh.vertices), "vertices")
         vertices, normals = mesh.vertices[self.vertices], mesh.vertex_normals[self.vertices]
         if self.weights is not None:

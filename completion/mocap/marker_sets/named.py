@@ -13,7 +13,7 @@ import numpy as np
 from model.body import BodyModel
 from scanprep.geometry import storage
 from scanprep.geometry.landmarks import read_landmarks
-from scanprep.geometry.mesh import Mesh
+from scanprep.geometry.mesh import Mesh, take_any_mesh
 from scanprep.geometry.surface import Surface
 from scanprep.judgement import size
 from scanprep.skeleton.tree import Skeleton
@@ -66,18 +66,18 @@ def layout_summaries() -> list[tuple[str, int, str, str]]:
     return out
 
 
-def load_layout(name: str, template: Mesh, kept: np.ndarray | None = None) -> MarkerLayout:
+@take_any_mesh
+def load_layout(name: str, template: Mesh | BodyModel, kept: np.ndarray | None = None) -> MarkerLayout:
     """Load a built-in marker set for a known body: the triangles of SCAPE and SPRING, or of the synthetic people.
 
     Parameters
     ----------
     name : str
         One of `layout_names()`, such as "cmu41".
-    template : Mesh
-        Recognised by its triangles, in any shape and pose.
+    template : Mesh or BodyModel
+        Recognised by its triangles, in any shape and pose. Of a model its template.
     kept : (N,) int, optional
-        The vertices of the synthetic people that a template with fewer triangles kept: `info["people_vertices"]` of
-        its model.
+        The vertices of the synthetic people that a template with fewer triangles kept; a model knows them.
 
     Returns
     -------
@@ -92,7 +92,7 @@ def load_layout(name: str, template: Mesh, kept: np.ndarray | None = None) -> Ma
     --------
     >>> from model import load_built_in_model
     >>> model = load_built_in_model()
-    >>> load_layout("cmu41", model.template, np.array(model.info["people_vertices"]))
+    >>> load_layout("cmu41", model)
     MarkerLayout(41 markers)
 
     [MoSh]
@@ -100,6 +100,9 @@ def load_layout(name: str, template: Mesh, kept: np.ndarray | None = None) -> Ma
     if name not in layout_names():
         raise ValueError(f"name: expected a marker layout of {', '.join(layout_names())}, got {name!r}; for another, "
                          + OWN)
+    if isinstance(template, BodyModel):
+        kept = template.info.get("people_vertices") if kept is None else kept
+        template = template.template
     bodies = [(path, tree["body"]) for path, tree in _files() if tree["name"] == name]
     digest = faces_digest(template.faces)
     for path, body in bodies:
@@ -125,7 +128,7 @@ def _files() -> tuple[tuple[Path, dict[str, Any]], ...]:
     return tuple((path, storage.read_json(path, "a marker layout")) for path in sorted(FOLDER.glob("*.json")))
 
 
-def fitting_layout(labels: Sequence[str], template: Mesh, kept: np.ndarray | None = None
+def fitting_layout(labels: Sequence[str], template: Mesh | BodyModel, kept: np.ndarray | None = None
                    ) -> tuple[MarkerLayout, str]:
     """Find the built-in layout that knows most labels, and its name; ValueError where none knows three of them.
 
@@ -151,11 +154,10 @@ def fitting_layout(labels: Sequence[str], template: Mesh, kept: np.ndarray | Non
 
 def choose_layout(model: BodyModel, given: str | Path | None, labels: Sequence[str]) -> tuple[MarkerLayout, str]:
     """Return the layout that is named, or in a file, or the built-in one that fits labels best; and its name."""
-    kept = model.info.get("people_vertices")
-    of_people = None if kept is None else np.array(kept)
     if given is None:
-        return fitting_layout(labels, model.template, of_people)
-    return read_layout(given, model.template, of_people, model.skeleton).with_spellings(labels), str(given)
+        return fitting_layout(labels, model)
+    found = read_layout(given, model.template, model.info.get("people_vertices"), model.skeleton)
+    return found.with_spellings(labels), str(given)
 
 
 def read_layout(given: str | Path, template: Mesh, kept: np.ndarray | None = None, skeleton: Skeleton | None = None

@@ -6,8 +6,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from model.body import BodyModel
 from scanprep.correspondence.correlated import find_correspondences
-from scanprep.geometry.mesh import Mesh
+from scanprep.geometry.mesh import Mesh, take_any_mesh
 from scanprep.registration.nonrigid import register
 from scanprep.registration.schedule import RegistrationConfig
 
@@ -50,9 +51,10 @@ class TransferredLayout:
     registered: Mesh
 
 
-def transfer_layout(layout: MarkerLayout, source: Mesh, target: Mesh, landmarks: Landmarks | None = None,
-                    config: RegistrationConfig | None = None, progress: Callable[[int, int], None] | None = None, *,
-                    search: bool = True) -> TransferredLayout:
+@take_any_mesh
+def transfer_layout(layout: MarkerLayout, source: Mesh | BodyModel, target: Mesh | BodyModel,
+                    landmarks: Landmarks | None = None, config: RegistrationConfig | None = None,
+                    progress: Callable[[int, int], None] | None = None, *, search: bool = True) -> TransferredLayout:
     """Transfer a layout to another body: the source is registered to the target and carries its markers.
 
     On a target with the same triangles, in any pose and shape, markers stay on their vertices. Labels, distances from
@@ -62,8 +64,8 @@ def transfer_layout(layout: MarkerLayout, source: Mesh, target: Mesh, landmarks:
     ----------
     layout : MarkerLayout
         Of the source.
-    source, target : Mesh
-        One connected manifold component each.
+    source, target : Mesh or BodyModel
+        One connected manifold component each; of a model its template.
     landmarks : (K,) int and (K, 3) float, metres, optional
         Vertices of the source and their places on the target. Without them, correspondences are found by shape, which
         cannot tell how far a smooth limb is rotated about its axis.
@@ -95,6 +97,7 @@ def transfer_layout(layout: MarkerLayout, source: Mesh, target: Mesh, landmarks:
 
     [Allen]
     """
+    source, target = (body.template if isinstance(body, BodyModel) else body for body in (source, target))
     layout.place(source)                                              # ValueError for a layout of another body
     if np.array_equal(source.faces, target.faces):
         L = len(layout.labels)

@@ -13,9 +13,12 @@ import numpy as np
 from model.body import BodyModel
 from model.learning.sexes import SexGuess, guess_sex, sex_plane
 from model.linear import Subject
+from model.people import person_judgement
 from scanprep.batch.room import Step, run_uncached, substeps
+from scanprep.judgement import Judgement
 from scanprep.ranges import Settings
 from scanprep.threads import one_thread
+from scanprep.words import describe_result
 
 from ...motion import Motion, Progress
 from ..angle_conventions import AngleConfig, define_segments, find_landmarks
@@ -23,12 +26,14 @@ from ..angle_errors import expect_angle_errors
 from ..artefacts.find import find_artefacts, no_artefacts, relabel_by_tracks
 from ..artefacts.results import ArtefactConfig, MarkerArtefacts
 from ..files.markers import MarkerSequence
-from ..joint_angles import Known, angle_table
+from ..joint_angles import Known, angle_doubts, angle_table
 from ..marker_sets.layout import MarkerLayout
-from ..pose.coverage import find_told_parts
+from ..pose.coverage import Coverage, find_coverage, find_told_parts
 from ..pose.follow import animate
+from ..pose.judgement import judge_motions, motion_doubts, motion_problem
 from ..pose.marked_body import RATE, AnimateConfig
 from ..pose.pelvis import follow_pelvis
+from ..pose.witnesses import ask_witnesses, witness_doubts
 from ..soft_tissue.follow import SoftTissueConfig, follow_soft_tissue
 from ..soft_tissue.soft_tissue import SoftTissue
 from ..subject.misplaced_markers import MisplacedMarkers, find_misplaced_markers
@@ -37,6 +42,7 @@ from .inputs import MarkerSource, load_default_model, read_recordings, recognise
 
 T = TypeVar("T")
 STEPS = 100                          # steps of progress for each stage
+UNLABELLED = Judgement()             # of labels that are those of the files
 
 
 @dataclass(frozen=True)
@@ -137,14 +143,18 @@ class MoshResult:
         Elapsed and processor time of each stage: "person", "poses", "artefacts", "soft tissue".
     angles : AngleConfig
         Convention of the joint angles.
+    recordings : tuple of MarkerSequence
+        The markers as they were recorded.
+    usual : MarkerLayout
+        Where such markers usually sit.
 
     Examples
     --------
     >>> from completion import load_layout
     >>> from model import load_built_in_model
     >>> model = load_built_in_model()
-    >>> layout = load_layout("cmu41", model.template, np.array(model.info["people_vertices"]))
-    >>> still = MarkerSequence(np.stack([layout.place(model.template)] * 4), layout.labels, 120.0)
+    >>> layout = load_layout("cmu41", model)
+    >>> still = MarkerSequence(np.stack([layout.place(model)] * 4), layout.labels, 120.0)
     >>> quick = MoshConfig(PersonConfig(frames=2, n_betas=3, annealing=(10.0, 1.0)), soft_tissue=False, repair=False)
     >>> result = mosh(still, config=quick)
     >>> result.betas.shape, sorted(result.seconds)
@@ -165,11 +175,40 @@ class MoshResult:
     misplaced: MisplacedMarkers = field(default_factory=MisplacedMarkers)
     seconds: dict[str, np.ndarray] = field(default_factory=dict)
     angles: AngleConfig = field(default_factory=AngleConfig)
+    recordings: tuple[MarkerSequence, ...] = ()
+    usual: MarkerLayout | None = None
+    __repr__ = describe_result
 
     @cached_property
     def subject(self) -> Subject:
         """The body of the person."""
         return self.model.subject(self.betas)
+
+    @cached_property
+    def covered(self) -> Coverage:
+        """Which parts of the body the markers of all sequences determine."""
+        return find_coverage(self.subject, self.layout, self.motions, self.recordings)
+
+    @cached_property
+    def judgement(self) -> Judgement:
+        """The verdict of `scape mosh` on the person and all motions."""
+        return self.judge({i: f"recording {i + 1}" for i in range(len(self.motions))})
+
+    def judge(self, names: Mapping[int, str], labelling: Judgement = UNLABELLED) -> Judgement:
+        """Judge the person and the motions of some sequences, by number and name; `labelling` is that of the labels."""
+        subject, problems, doubts = self.subject, list[str](), list[str]()
+        for i, name in names.items():
+            motion, markers, whose = self.motions[i], self.recordings[i], f"{name}: " if len(names) > 1 else ""
+            told = find_told_parts(subject, self.layout, motion)
+            off = ask_witnesses(motion, subject, markers, self.covered.used)
+            problem = motion_problem(motion, subject.template, self.layout, markers)
+            problems += [whose + problem] if problem else []
+            doubts += [whose + why for why in (*angle_doubts(motion, subject, told), *witness_doubts(off))]
+        motions, usual = [self.motions[i] for i in names], self.usual or self.layout
+        moving = motion_doubts(motions, [self.recordings[i] for i in names], self.model.template)
+        own = self.covered.judgement().merge(labelling, Judgement.of(problems, (*moving, *doubts)),
+                                             self.misplaced.judgement(usual.labels), self.person.judgement(usual))
+        return judge_motions(person_judgement(self.model, self.betas), own, motions, self.model.template)
 
     def joint_angles(self, number: int = 0) -> Any:
         """Return the joint angles of a motion as `angle_table` does, with errors; NaN where no marker tells."""
@@ -224,8 +263,8 @@ def mosh(recordings: MarkerSource | Sequence[MarkerSource], model: BodyModel | N
     >>> from completion import load_layout
     >>> from model import load_built_in_model
     >>> model = load_built_in_model()
-    >>> layout = load_layout("cmu41", model.template, np.array(model.info["people_vertices"]))
-    >>> still = MarkerSequence(np.stack([layout.place(model.template)] * 4), layout.labels, 120.0)
+    >>> layout = load_layout("cmu41", model)
+    >>> still = MarkerSequence(np.stack([layout.place(model)] * 4), layout.labels, 120.0)
     >>> write_markers("still.c3d", still)
     >>> quick = PersonConfig(frames=2, n_betas=3, annealing=(10.0, 1.0))
     >>> result = mosh("still.c3d", config=MoshConfig(quick, soft_tissue=False, repair=False))
@@ -274,7 +313,7 @@ def mosh(recordings: MarkerSource | Sequence[MarkerSource], model: BodyModel | N
     every = [trial.result() for trial in trials]
     return MoshResult(model, person.fit.betas, person.fit.layout, person.fit, tuple(motion for motion, _, _ in every),
                       tuple(soft for _, soft, _ in every if soft is not None), tuple(found for *_, found in every),
-                      misplaced, stages.seconds, config.angles)
+                      misplaced, stages.seconds, config.angles, tuple(sequences), layout)
 
 
 @dataclass(eq=False)

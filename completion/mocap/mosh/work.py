@@ -43,17 +43,16 @@ from ..joint_angles import (
     Known,
     SegmentAxes,
     anatomical_angles,
-    angle_doubts,
     find_static_zero,
 )
 from ..labelling.labelled_file import label_first, show_labels
 from ..marker_sets.layout import MarkerLayout
 from ..marker_sets.named import choose_layout
-from ..pose.coverage import Coverage, find_coverage, find_told_parts, untold_spans
+from ..pose.coverage import Coverage, find_told_parts, untold_spans
 from ..pose.follow import animate
-from ..pose.judgement import judge_motions, markers_told, motion_doubts, motion_problem
+from ..pose.judgement import markers_told
 from ..pose.pelvis import follow_pelvis
-from ..pose.witnesses import ask_witnesses, witness_doubts
+from ..pose.witnesses import ask_witnesses
 from ..retargeting.retarget import retarget
 from ..retargeting.soft_tissue import picture_transfer, retarget_soft_tissue, write_character
 from .mosh import MoshConfig, MoshResult, clocks, mosh, mosh_by_sex
@@ -157,11 +156,10 @@ class _Found:
         """Judgement of the body: whether a person can have it."""
         return person_judgement(self.model, self.result.betas)
 
-    @cached_property
+    @property
     def covered(self) -> Coverage:
         """Which parts of the body the markers of all sequences determine."""
-        return find_coverage(self.takes[0].subject, self.result.layout, [take.motion for take in self.takes],
-                             [take.markers for take in self.takes])
+        return self.result.covered
 
     def told(self, take: Take) -> np.ndarray:
         """Find in which frames the markers determine which parts, (T, J) bool."""
@@ -180,19 +178,8 @@ class _Found:
 
     def judgement(self, takes: Sequence[Take]) -> Judgement:
         """Judge the person and the motions of some sequences."""
-        body, result, several = self.model.template, self.result, len(takes) > 1
-        motions = [take.motion for take in takes]
-        problems = [(f"{take.name}: " if several else "") + why for take in takes if (why := motion_problem(
-            take.motion, take.subject.template, result.layout, take.markers))]
-        angles = tuple((f"{take.name}: " if several else "") + why for take in takes
-                       for why in angle_doubts(take.motion, take.subject, self.told(take)))
-        witnesses = tuple((f"{take.name}: " if several else "") + why for take in takes
-                          for why in witness_doubts(self.ask_witnesses(take)))
-        moving = Judgement.of(problems, motion_doubts(motions, [take.markers for take in takes], body) + angles
-                              + witnesses)
-        own = self.covered.judgement().merge(self.labelling, moving, result.misplaced.judgement(self.usual.labels),
-                                             result.person.judgement(self.usual))
-        return judge_motions(self.person, own, motions, body)
+        result = self.result if self.result.usual is self.usual else replace(self.result, usual=self.usual)
+        return result.judge({self.takes.index(take): take.name for take in takes}, self.labelling)
 
 
 def _solve(work: MoshTask, actor: Actor, context: TaskContext) -> tuple[_Found, list[str]]:

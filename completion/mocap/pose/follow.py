@@ -63,8 +63,8 @@ def animate(subject: Subject, markers: MarkerSequence, layout: MarkerLayout, con
     >>> from completion import load_layout
     >>> from model import load_built_in_model
     >>> model = load_built_in_model()
-    >>> layout = load_layout("cmu41", model.template, np.array(model.info["people_vertices"]))
-    >>> still = MarkerSequence(np.stack([layout.place(model.template)] * 5), layout.labels, 120.0)
+    >>> layout = load_layout("cmu41", model)
+    >>> still = MarkerSequence(np.stack([layout.place(model)] * 5), layout.labels, 120.0)
     >>> motion = animate(model.subject(), still, layout)
     >>> motion.poses.shape, bool(motion.residuals.max() < 0.005)
     ((5, 16, 3), True)

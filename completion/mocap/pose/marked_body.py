@@ -17,7 +17,7 @@ import numpy as np
 from model.features import twists
 from model.fitting import energy
 from model.fitting.bodies import FixedBody
-from model.linear import Subject
+from model.linear import Subject, check_subject
 from model.priors import gaussian_prior
 from scanprep.geometry import rotations
 from scanprep.geometry.least_squares import Dense, Minimum, levenberg_marquardt, retract_pose, step_between
@@ -92,7 +92,7 @@ class MarkedBody:
     """
 
     def __init__(self, subject: Subject, layout: MarkerLayout, prior_weight: float, prior_shrinkage: float) -> None:
-        self.body = FixedBody(subject)
+        self.body = FixedBody(check_subject(subject))
         self.count = len(layout.labels)
         self.n_unknowns = self.body.n_angles + 3
         ids, weights = supports(subject.template, layout)

@@ -68,7 +68,7 @@ class MarkerStream:
     >>> from completion import load_layout
     >>> from model import load_built_in_model
     >>> model = load_built_in_model()
-    >>> layout = load_layout("cmu41", model.template, np.array(model.info["people_vertices"]))
+    >>> layout = load_layout("cmu41", model)
     >>> stream = MarkerStream(model.subject(), layout, layout.labels, 120.0)
     >>> frame = stream.push(layout.place(model.template))
     >>> frame.pose.shape, bool(frame.residuals.max() < 0.005)

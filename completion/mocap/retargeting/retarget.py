@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from model.body import BodyModel
-from model.linear import Subject
+from model.linear import Subject, check_subject
 from scanprep.geometry import rotations
 from scanprep.pictures.camera import guess_upright
 
@@ -52,8 +52,8 @@ def retarget(motion: Motion, source: Subject, target: Subject) -> Motion:
 
     [SCAPE] §8
     """
-    J = len(source.skeleton.parents)
-    if len(target.skeleton.parents) != J or motion.poses.shape[1] != J:
+    J = len(check_subject(source).skeleton.parents)
+    if len(check_subject(target).skeleton.parents) != J or motion.poses.shape[1] != J:
         raise ValueError(f"target: expected a body of the {J} parts that move, got {len(target.skeleton.parents)}")
     # scale the path over the ground
     up, sign = world_up(motion, source)

@@ -127,8 +127,8 @@ def follow_soft_tissue(model: BodyModel, motion: Motion, markers: MarkerSequence
     >>> from completion import animate, load_layout
     >>> from model import load_built_in_model
     >>> model = load_built_in_model()
-    >>> layout = load_layout("cmu41", model.template, np.array(model.info["people_vertices"]))
-    >>> still = MarkerSequence(np.stack([layout.place(model.template)] * 5), layout.labels, 120.0)
+    >>> layout = load_layout("cmu41", model)
+    >>> still = MarkerSequence(np.stack([layout.place(model)] * 5), layout.labels, 120.0)
     >>> motion = animate(model.subject(np.zeros(2)), still, layout)
     >>> follow_soft_tissue(model, motion, still, layout).skin.moved.shape
     (5, 41, 3)

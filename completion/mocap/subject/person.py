@@ -14,6 +14,7 @@ from scanprep.geometry import rotations
 from scanprep.geometry.farthest_points import farthest_points, spread_indices
 from scanprep.judgement import Judgement
 from scanprep.threads import one_thread
+from scanprep.words import describe_result
 
 from ...motion import Progress
 from ..files.markers import MarkerSequence
@@ -57,6 +58,7 @@ class PersonFit:
     energies: dict[str, float]
     converged: bool
     iterations: int
+    __repr__ = describe_result
 
     @property
     def residual(self) -> float:
@@ -141,7 +143,7 @@ def find_person(model: BodyModel, sequences: MarkerSequence | Sequence[MarkerSeq
     >>> from completion import load_layout
     >>> from model import load_built_in_model
     >>> model = load_built_in_model()
-    >>> layout = load_layout("cmu41", model.template, np.array(model.info["people_vertices"]))
+    >>> layout = load_layout("cmu41", model)
     >>> walk = MarkerSequence(np.stack([layout.place(model.template)] * 3), layout.labels, 120.0)
     >>> quick = PersonConfig(frames=2, n_betas=3, annealing=(10.0, 1.0))
     >>> find_person(model, walk, layout, quick).betas.shape
