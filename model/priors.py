@@ -11,9 +11,9 @@ from .body import BodyModel
 from .linear import check_pose
 
 LEAST_POSES = 5                      # fewer poses give no quantiles for joint limits
-# metres: a model with a larger error on poses left out of learning is doubtful. A model of 8 poses and 10 men is 13 mm
-# off; one of 3 poses is 26 mm off, and 24 of the 38 bodies that it completes are wrong.
-CRUDE = 0.03
+# share of the size: a model with a larger error on poses left out of learning is doubtful, 30 mm on a man. A model of 8
+# poses and 10 men is 13 mm off; one of 3 poses is 26 mm off, and 24 of the 38 bodies that it completes are wrong.
+CRUDE = 0.022
 STIFF = np.radians(5)                # a joint that turned less than this in every pose counts as never bent
 
 

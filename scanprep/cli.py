@@ -56,25 +56,33 @@ def group(argv: list[str]) -> int:
     return dispatch(COMMANDS, "scape prep", argv, "From raw scans to registered meshes and a skeleton.")
 
 
-def read_poses(folder: Path, template: Path | None, subject: str | None, unit: Unit | None) -> tuple[Mesh, np.ndarray]:
-    """Read template and vertices (M, N, 3) of one person from a registered set or a folder of meshes.
+def read_poses(folder: Path, template: Path | None, subject: str | None, unit: Unit | None
+               ) -> tuple[Mesh, np.ndarray, tuple[str, ...]]:
+    """Read template, vertices (M, N, 3) and names of one person's poses from a registered set or a folder of meshes.
 
     Of meshes with several components the largest is read, and the others are attached to the template.
+    ValueError, with its name, for a mesh that is no pose of the others.
     """
     from .dataset import RegisteredSet
     from .geometry.attached import take_body
     from .geometry.files import read_mesh, read_registered
+    from .geometry.members import ONE_BODY, check_members
     from .geometry.mesh import Mesh
 
     if (folder / "set.json").exists():
         registered = RegisteredSet.load(folder)
-        return registered.template, registered.poses(subject)
-    meshes = read_registered(folder, unit)
-    mesh = read_mesh(template, unit) if template else Mesh(meshes.vertices[0], meshes.faces, up=meshes.up)
-    if not np.array_equal(mesh.faces, meshes.faces):
-        raise ValueError(f"{template}: expected the triangles of the meshes in {folder}; it has other ones")
-    body = take_body(mesh)
-    return body, meshes.vertices if body.attached is None else meshes.vertices[:, body.attached.body]
+        mesh, names = registered.template, registered.names_of(subject)
+        poses = registered.vertices(names)
+    else:
+        meshes = read_registered(folder, unit)
+        whole = read_mesh(template, unit) if template else Mesh(meshes.vertices[0], meshes.faces, up=meshes.up)
+        if not np.array_equal(whole.faces, meshes.faces):
+            raise ValueError(f"{template}: expected the triangles of the meshes in {folder}; it has other ones")
+        mesh, poses, names = take_body(whole), meshes.vertices, meshes.names
+        if mesh.attached is not None:
+            poses = poses[:, mesh.attached.body]
+    check_members(mesh, poses, str(folder), names, ONE_BODY)
+    return mesh, poses, names
 
 
 def about_mesh(mesh: Mesh) -> list[Metric]:

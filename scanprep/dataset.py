@@ -265,13 +265,17 @@ class RegisteredSet:
         ValueError
             An unknown subject, or an empty set.
         """
+        return self.vertices(self.names_of(subject))
+
+    def names_of(self, subject: str | None = None) -> tuple[str, ...]:
+        """Return the names of all meshes of one subject, by default of the one with the most, as `poses` reads them."""
         if not self.entries:
             raise ValueError(f"{self.folder}: the set holds no meshes")
         count = [entry.subject for entry in self.entries].count
         wanted = max(self.subjects, key=count) if subject is None else subject
         if wanted not in self.subjects:
             raise ValueError(f"subject: expected one of {', '.join(self.subjects)}, got {wanted!r}")
-        return self.vertices([entry.name for entry in self.entries if entry.subject == wanted])
+        return tuple(entry.name for entry in self.entries if entry.subject == wanted)
 
     def shapes(self) -> np.ndarray:
         """Read the vertices of one mesh of every subject, the one that was added first.

@@ -12,6 +12,7 @@ from completion.mocap.pose.marked_body import MarkedBody, marker_weights, suppor
 from completion.motion import Motion
 from model.fitting import energy
 from scanprep.geometry import rotations
+from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.storage import StorageError
 
 FRAMES = 60
@@ -74,6 +75,22 @@ def test_a_frame_has_converged_where_the_last_round_left_it(subject, layout, wal
     once = AnimateConfig(smoothing=1)
     assert not animate(subject, sequence, layout, once, near=beside).converged.any()
     assert animate(subject, sequence, layout, once, near=found).converged.all()
+
+
+def test_a_body_ten_times_as_large_settles_as_well(subject, layout, walk):
+    """The limit was 5 mm for everybody: large animals never settled, and small ones always."""
+    model, (_, sequence) = worm_with_prior(), walk
+    skeleton = replace(model.skeleton, joints=10 * model.skeleton.joints)
+    large = replace(model, template=Mesh(10 * model.template.vertices, model.template.faces), skeleton=skeleton)
+    wide = AnimateConfig(smoothing=2, marker_sd=0.1, outlier=0.6, place_acceleration=150)
+    found = animate(subject, sequence, layout, AnimateConfig(smoothing=6))
+    beside = replace(found, poses=found.poses + 0.15 * np.sin(np.arange(FRAMES))[:, None, None] ** 8)
+    once = animate(subject, sequence, layout, AnimateConfig(smoothing=2), near=beside)
+    again = animate(large.subject(np.array([0.5, -0.5, 0.2])), changed(sequence, 10 * sequence.positions),
+                    MarkerLayout(layout.labels, layout.vertices, 0.12), wide,
+                    near=replace(beside, trans=10 * beside.trans))
+    assert once.converged.all() and again.converged.all()
+    np.testing.assert_allclose(again.poses, once.poses, atol=0.01)
 
 
 def test_missing_markers_are_left_out(subject, layout, walk):

@@ -479,16 +479,44 @@ def test_betas_that_somebody_typed_are_the_cause_of_the_body_that_they_make():
 def test_time_that_is_told_wrongly_is_seen_in_the_speed_of_markers():
     model, layout = worm_with_prior(), MarkerLayout(LABELS, ROWS, 0.012)
     markers = walk(layout)
-    motion = SimpleNamespace(residuals=np.full(markers.positions.shape[:2], 0.004), distrusted=(), labels=LABELS)
+    motion = SimpleNamespace(residuals=np.full(markers.positions.shape[:2], 0.004), distrusted=(), labels=LABELS,
+                             converged=np.ones(len(markers.positions), dtype=bool))
     assert motion_doubts([motion], [markers], model.template) == ()
     (told,) = motion_doubts([motion], [dataclasses.replace(markers, rate=300.0)], model.template)
     assert told.endswith("frames in another order, or the wrong rate?")
-    off = SimpleNamespace(residuals=motion.residuals + 0.02 * size(model.template), distrusted=(), labels=LABELS)
+    off = SimpleNamespace(**{**vars(motion), "residuals": motion.residuals + 0.02 * size(model.template)})
     assert "mm from where the body has them" in motion_doubts([off], [markers], model.template)[0]
     lost = Motion(np.zeros((len(markers.positions), 1, 3)), np.zeros((len(markers.positions), 3)), None, 300.0,
                   np.full(markers.positions.shape[:2], 0.5), LABELS)
     told = motion_problem(lost, model.template, layout, dataclasses.replace(markers, rate=300.0))
     assert told.endswith("the wrong rate?")                    # not swapped labels
+
+
+@pytest.mark.parametrize("scale", [0.1, 1.0, 10.0])
+def test_a_motion_that_did_not_settle_or_lost_the_body_needs_a_look(scale):
+    """Whatever the size: it was good with no frame settled, and with markers 27 cm off in one frame."""
+    model, layout = worm_with_prior(), MarkerLayout(LABELS, ROWS, 0.012)
+    markers, body = walk(layout), Mesh(scale * model.template.vertices, model.template.faces)
+    far = np.full(markers.positions.shape[:2], 0.003 * size(body))
+    motion = SimpleNamespace(residuals=far, distrusted=(), labels=LABELS, converged=np.ones(len(far), dtype=bool))
+    slow = dataclasses.replace(markers, positions=scale * markers.positions)
+    assert motion_doubts([motion], [slow], body) == ()
+    # a quarter is unsettled in the fastest good recordings; frames that show nothing cannot settle
+    motion.converged = np.arange(len(far)) % 4 > 0
+    assert motion_doubts([motion], [slow], body) == ()
+    hidden = SimpleNamespace(**{**vars(motion), "residuals": np.where(motion.converged[:, None], far, np.nan)})
+    hidden.converged = motion.converged & (np.arange(len(far)) % 4 > 1)
+    assert motion_doubts([hidden], [slow], body) == ()
+    motion.converged = np.zeros(len(far), dtype=bool)
+    (doubt,) = motion_doubts([motion], [slow], body)
+    assert doubt.startswith("only 0% of the frames settled")
+    # one ghost marker is no lost body, half of the markers are
+    motion.converged[:] = True
+    far[2, 0] = size(body)
+    assert motion_doubts([motion], [slow], body) == ()
+    far[2, ::2], far[2, 1] = 0.2 * size(body), 0.2 * size(body)
+    (doubt,) = motion_doubts([motion], [slow], body)
+    assert doubt.startswith(f"in 1 of {len(far)} frames half of the markers are far")
 
 
 def test_a_ghost_of_one_frame_says_nothing_of_the_unit():

@@ -143,7 +143,7 @@ def test_a_mix_wants_a_set_and_a_skeleton(folder, tmp_path):
 def test_parts_are_found_where_none_are_given(folder, tmp_path):
     """Those that the search alone finds in the same poses."""
     outcome = learned(folder / "poses", tmp_path / "m.npz", scape=QUICK)
-    template, poses = read_poses(folder / "poses", None, None, None)
+    template, poses, _ = read_poses(folder / "poses", None, None, None)
     found = len(choose_skeleton(template, poses).skeleton.parents)
     assert {m.name: m.value for m in outcome.metrics}["parts of the skeleton"] == found > 2
     assert json.loads(json.dumps(load_model(tmp_path / "m.npz").info))["shapes"] == 0

@@ -161,7 +161,7 @@ def test_models_by_sex_take_the_movement_alone_from_the_prior(known):
 def test_people_told_to_be_one_are_doubted(known, other):
     """Poses of one worm and meshes of others: the prior misses what it knows, and the judgement asks who it is."""
     rng = np.random.default_rng(8)
-    bodies = [known.vertices(pose, 4 * rng.normal(size=3)) for pose in random_poses(known, 6, rng, 0.4)]
+    bodies = [known.vertices(pose, 2 * rng.normal(size=3)) for pose in random_poses(known, 6, rng, 0.4)]
     model = learn_scape(known.template, np.stack([known.template.vertices, *bodies]), None, known.skeleton, CONFIG,
                         prior=prior_of(known))
     assert any("two people" in reason for reason in judge_model(model).reasons)

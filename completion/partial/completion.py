@@ -405,7 +405,7 @@ def completion_doubts(fit: ScanFit, x: np.ndarray, error: np.ndarray, seen: np.n
     doubts += [f"the {joint_in_words(names[j])} is {np.degrees(strange[j]):.0f} degrees from any way that it is known "
                "to be held" for j in np.argsort(-strange) if strange[j] > STRANGE]
     # a model that is inexact on poses it was not learned from
-    if (left_out := fit.body.left_out_error) is not None and left_out > CRUDE:
+    if (left_out := fit.body.left_out_error) is not None and left_out > CRUDE * size(fit.body.template):
         doubts.append(f"the model was {1000 * left_out:.0f} mm off in poses that it was not learned from: "
                       "it needs more")
     return doubts + find_stray(fit, x)

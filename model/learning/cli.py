@@ -19,6 +19,7 @@ from scanprep.console import Metric, Outcome, bar, details
 from scanprep.dataset import RegisteredSet
 from scanprep.geometry.files import list_meshes, name_of
 from scanprep.geometry.landmarks import read_landmark_vertices
+from scanprep.geometry.members import check_members, find_spikes
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.tables import read_table
 from scanprep.geometry.upright import find_up
@@ -98,15 +99,13 @@ def learn(poses: Path, output: Output, shapes: Path | None = None, template: Pat
     if prior not in ("auto", "none") and not with_prior:
         raise UsageError(f"--prior {prior}: expected the kind {' or '.join(WITH_PRIOR)} and not --preset published")
     # bodies to learn from, and the landmarks that the model keeps
-    if kind == "mixed":
-        if not (poses / "set.json").exists():
-            raise ValueError(f"{poses}: expected a registered set, which says whose mesh each is, found a plain folder")
-        whole = RegisteredSet.load(poses)
-        body, posed, who = whole.template, whole.vertices(), [one.subject or one.name for one in whole.entries]
-    else:
-        (body, posed), who = read_poses(poses, template, subject, unit), []
+    (body, posed, names), who = (_read_mix(poses) if kind == "mixed" else
+                                 (read_poses(poses, template, subject, unit), []))
     body = find_up(body if up is None else dataclasses.replace(body, up="xyz".index(up)), posed)
-    people = None if shapes is None else _read_people(shapes, body, unit)
+    people, spikes = None, find_spikes(body, posed, str(poses), names)
+    if shapes is not None:
+        people, names = _read_people(shapes, body, unit)
+        spikes += find_spikes(body, people, str(shapes), names)
     sexes = None if not by_sex or shapes is None else _read_sexes(shapes)
     marks = landmarks or poses / "landmarks.json"
     named = read_landmark_vertices(marks, body) if landmarks or marks.exists() else {}
@@ -131,11 +130,12 @@ def learn(poses: Path, output: Output, shapes: Path | None = None, template: Pat
             {"neutral": learn_blendscape(body, posed, people, tree, scape, *how, known)} if kind == "blendscape" else
             {"neutral": learn_skinning(body, posed, people, tree, skinning, *how)} if kind == "skinning" else
             {"neutral": learn_scape(body, posed, people, tree, scape, *how, known)})
+    models = {name: dataclasses.replace(model, info={                                  # type: ignore[type-var]
+        **model.info, "landmarks": named, "spikes": spikes}) for name, model in models.items()}
     for name, model in models.items():
         path = output if name == "neutral" else output.with_suffix(f".{name}.npz")
-        kept = dataclasses.replace(model, info={**model.info, "landmarks": named})     # type: ignore[type-var]
-        kept.save(path)
-        _draw(kept, path)
+        model.save(path)
+        _draw(model, path)
     return Outcome(output, [
         *about(models["neutral"]), Metric("poses", len(posed)),
         Metric("people", 0 if people is None else len(people)), Metric("parts of the skeleton", len(tree.parents)),
@@ -147,13 +147,24 @@ def learn(poses: Path, output: Output, shapes: Path | None = None, template: Pat
                    following=f"look at it: scape view {quote(str(output))}")
 
 
-def _read_people(shapes: Path, body: Mesh, unit: Unit | None) -> np.ndarray:
-    """Read the people (n, N, 3) whose differences are learned; one alone is refused before the skeleton is sought."""
-    people = read_bodies(shapes, body, unit)[0]
+def _read_mix(poses: Path) -> tuple[tuple[Mesh, np.ndarray, tuple[str, ...]], list[str]]:
+    """Read template, bodies (M, N, 3) and names of a registered set of many people, and whose body each is."""
+    if not (poses / "set.json").exists():
+        raise ValueError(f"{poses}: expected a registered set, which says whose mesh each is, found a plain folder")
+    whole = RegisteredSet.load(poses)
+    bodies = whole.vertices()
+    check_members(whole.template, bodies, str(poses), whole.names)
+    return (whole.template, bodies, whole.names), [entry.subject or entry.name for entry in whole.entries]
+
+
+def _read_people(shapes: Path, body: Mesh, unit: Unit | None) -> tuple[np.ndarray, tuple[str, ...]]:
+    """Read people (n, N, 3), whose differences are learned, and names; one alone is refused before the long work."""
+    people, names = read_bodies(shapes, body, unit)
     if len(people) < 2:
         raise ValueError(f"shapes: expected at least 2 people, got {len(people)} in {shapes}; a model of the poses of "
                          "one person needs none")
-    return people
+    check_members(body, people, str(shapes), names)
+    return people, names
 
 
 def _about_steps(step: KeptSteps) -> list[Metric]:

@@ -14,6 +14,7 @@ from operator import attrgetter
 import numpy as np
 
 from scanprep.batch.room import Step, run_uncached
+from scanprep.geometry.members import check_members, find_spikes
 from scanprep.geometry.mesh import Mesh, check_template
 from scanprep.geometry.upright import find_up
 from scanprep.skeleton.tree import Skeleton
@@ -101,6 +102,7 @@ def learn_scape_mix(template: Mesh, bodies: np.ndarray, subjects: Sequence[Hasha
     check_template(template)
     check_skeleton(template, skeleton)
     bodies = check_bodies(template, bodies, "bodies", 2)
+    check_members(template, bodies, "bodies")
     template = find_up(template, bodies)
     who, parts = number_people(subjects, len(bodies)), BlendedTemplate(template, skeleton, rigid_weights(skeleton))
     mix, inputs = Mix(parts, bodies, who, config), (parts, bodies, who, config)
@@ -124,6 +126,7 @@ def learn_scape_mix(template: Mesh, bodies: np.ndarray, subjects: Sequence[Hasha
     return ScapeModel(template, skeleton, state.space, shapes, *prior, {
         "settings": asdict(config), "bodies": len(bodies), "people": int(who.max()) + 1, "rounds": config.refinements,
         "pruning": state.design.pruning, "ridge": state.design.ridge, "features": state.space.features.count,
+        "spikes": find_spikes(template, bodies, "bodies"),
         "digest": digest(template, bodies, None), "digests": body_digests(bodies)}, pose_examples=examples)
 
 

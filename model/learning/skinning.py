@@ -15,14 +15,23 @@ from scanprep.skeleton.tree import Skeleton
 from scanprep.threads import one_thread
 
 from ..blend_weights import diffuse, diffuse_weights, fit_weights, strongest
-from ..digests import body_digest, digest
+from ..digests import body_digest
 from ..features import LinearLift, PoseFeatures, part_features
 from ..fitting.vertices import FitConfig, PoseFitter, ShapeFitter
 from ..pose_space import principal_directions
 from ..shape_space import body_volumes, learn_shape_space
 from ..skinning import SkinningModel, invert_blended
 from .regression import ridge_operator
-from .scape import POSES, Progress, ProgressShares, check_training, estimate_pose_prior, fit_poses, pose_examples
+from .scape import (
+    POSES,
+    Progress,
+    ProgressShares,
+    check_training,
+    describe_bodies,
+    estimate_pose_prior,
+    fit_poses,
+    pose_examples,
+)
 
 QUICK = FitConfig(sample=400, iterations=20, polish=0, tolerance=1e-4)     # poses are fitted again in the next round
 
@@ -124,8 +133,7 @@ def learn_skinning(template: Mesh, poses: np.ndarray, shapes: np.ndarray | None,
                           partial(_learn_people, model, shapes, config.components))
     examples = pose_examples(template, skeleton, at, shapes)
     mean, covariance = estimate_pose_prior(template, skeleton, examples, len(at))
-    info = {"settings": asdict(config), "poses": len(poses), "shapes": 0 if shapes is None else len(shapes),
-            **model.info, "digest": digest(template, poses, shapes)}
+    info = {"settings": asdict(config), **describe_bodies(template, poses, shapes), **model.info}
     return replace(model, pose_mean=mean, pose_covariance=covariance, pose_examples=examples, info=info)
 
 

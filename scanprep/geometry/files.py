@@ -361,6 +361,8 @@ def check_same_topology(path: Path, mesh: Mesh, first_path: Path, first: Mesh) -
     if counts != expected:
         raise MeshFileError(f"{path}: expected the topology of {first_path.name}, {expected}; found {counts}")
     if not np.array_equal(mesh.faces, first.faces):
+        if any(np.array_equal(np.roll(mesh.faces[:, ::-1], shift, axis=1), first.faces) for shift in range(3)):
+            raise MeshFileError(f"{path}: it is inside out: its faces are those of {first_path.name}, turned over")
         k = int(np.flatnonzero((mesh.faces != first.faces).any(axis=1))[0])
         raise MeshFileError(f"{path}: expected the faces of {first_path.name} in their order; there are as many, "
                             f"but from face {k} on they are others (another order, or edges flipped): "

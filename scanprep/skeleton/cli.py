@@ -11,6 +11,7 @@ from ..cli import Output, Person, Unit, read_poses
 from ..console import Metric, Outcome, bar
 from ..dataset import RegisteredSet
 from ..geometry.files import read_mesh
+from ..geometry.members import find_spikes
 from ..geometry.mesh import Mesh
 from ..judgement import Judgement
 from .edit import apply_edits, read_edits
@@ -35,7 +36,7 @@ def skeleton(poses: Annotated[Path, Place("POSES")], output: Output, template: P
         unit: Unit of the meshes.
         config: Settings.
     """
-    body, vertices = read_poses(poses, template, subject, unit)
+    body, vertices, names = read_poses(poses, template, subject, unit)
     with bar("finding the skeleton") as progress:
         search = search_skeleton(body, vertices, config, progress=progress)
     found = search.skeleton
@@ -49,7 +50,9 @@ def skeleton(poses: Annotated[Path, Place("POSES")], output: Output, template: P
         *(Metric(f"loop of {loop.length} links opened at",
                  f"{' and '.join(loop.parts)}, {'joined' if loop.joined else 'no longer linked'}")
           for loop in search.loops), *_shares(found, body)], {"skeleton": config},
-                   judgement=Judgement.of(skeleton_problem(search, config.parts), skeleton_doubts(found, config.parts)))
+                   judgement=Judgement.of(skeleton_problem(search, config.parts),
+                                          [*find_spikes(body, vertices, str(poses), names),
+                                           *skeleton_doubts(found, config.parts)]))
 
 
 def edit(skeleton: Annotated[Path, Place("SKELETON")], output: Output, template: Path | None = None,

@@ -9,6 +9,7 @@ import numpy as np
 
 from ..batch.pool import SideBySide
 from ..batch.room import Step, run_uncached
+from ..geometry.members import ONE_BODY, check_members
 from ..geometry.mesh import Mesh, check_template
 from .joints import (
     LOOP_SEPARATION,
@@ -53,6 +54,7 @@ class SkeletonFinder:
         bad = np.flatnonzero(~np.isfinite(poses).all(axis=(1, 2)))
         if len(bad):
             raise ValueError(f"poses: {len(bad)} have vertices that are not finite, the first is pose {bad[0]}")
+        check_members(template, poses, "poses", ratio=ONE_BODY)
         # left and right are tied if the body is symmetric, or if the settings say so
         self.template, self.config, self.symmetry = template, config, find_symmetry(template, poses)
         tied = self.symmetry.holds if config.symmetric is None else config.symmetric

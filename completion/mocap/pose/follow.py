@@ -7,6 +7,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from model.linear import Subject
+from scanprep.judgement import size
 from scanprep.threads import one_thread
 
 from ...motion import Motion, Progress
@@ -21,7 +22,8 @@ from .swaps import label_order
 
 __all__ = ["AnimateConfig", "animate"]
 
-STILL = 0.005                        # metres: a frame has converged when the last round moves no marker farther
+# share of the body's size, 5 mm on a man: a frame has converged when the last round moves no marker farther
+STILL = 0.0037
 
 
 @one_thread()
@@ -146,7 +148,7 @@ def follow_whole(body: MarkedBody, targets: np.ndarray, rate: float, config: Ani
         moved[inside] = np.linalg.norm(body.positions(x[inside]) - body.positions(near), axis=2).max(axis=1)
         report_progress(round(T * (i + 1) / rounds), T)
     seen = (~np.isnan(targets[..., 0])).any(axis=1)
-    result = x, order, seen & (moved < STILL)
+    result = x, order, seen & (moved < STILL * size(body.body.template))
     if not hinges.turned:
         return result
     unmended = follow_whole(body, targets, rate, config, report_progress, start, mend=False)

@@ -52,9 +52,27 @@ def mean_off(motions: Sequence[Motion]) -> float:
     return float(np.concatenate(seen).mean()) if any(map(len, seen)) else 0.0
 
 
+def doubt_frames(motions: Sequence[Motion], body: Mesh) -> tuple[str, ...]:
+    """Return doubts for frames that did not settle, and for those where half the markers are a hand's width off."""
+    settled = np.concatenate([motion.converged[np.isfinite(motion.residuals).any(axis=1)] for motion in motions])
+    doubts = list[str]()
+    # walks, a jump and a ball game settle in 75 to 100% of the frames
+    if len(settled) and settled.mean() < 0.5:
+        doubts.append(f"only {100 * settled.mean():.0f}% of the frames settled: too fast for the rate, markers that "
+                      "slide, or another body?")
+    # of at least three markers, as one alone may be a ghost
+    off = [float(np.median(row[np.isfinite(row)])) for motion in motions for row in motion.residuals
+           if np.isfinite(row).sum() >= 3]
+    far = sum(distance > HAND * size(body) for distance in off)
+    if far:
+        doubts.append(f"in {far} of {len(off)} frames half of the markers are far from where the body has them, up to "
+                      f"{1000 * max(off):.0f} mm: the body is lost there")
+    return tuple(doubts)
+
+
 def motion_doubts(motions: Sequence[Motion], markers: Sequence[MarkerSequence], body: Mesh) -> tuple[str, ...]:
     """Return reasons to look at motions of one body from markers; `body` is the model's template."""
-    reasons = [*hardly_seen(motions), *find_distrusted_markers(motions)]
+    reasons = [*hardly_seen(motions), *doubt_frames(motions, body), *find_distrusted_markers(motions)]
     off = mean_off(motions)
     # 0.018 of the size, 25 mm on a man: good motions are 4 to 25 mm off, shuffled frames 31
     if off > 0.018 * size(body):

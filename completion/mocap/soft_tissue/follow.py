@@ -13,6 +13,7 @@ import numpy as np
 from model.body import BodyModel
 from scanprep.geometry.least_squares import Dense
 from scanprep.geometry.sparse import overlapping_windows, solve_smooth
+from scanprep.judgement import size
 from scanprep.ranges import Positive, Settings
 from scanprep.threads import one_thread
 
@@ -171,7 +172,7 @@ def follow_soft_tissue(model: BodyModel, motion: Motion, markers: MarkerSequence
     residuals = np.full(markers.positions.shape[:2], np.nan)
     residuals[:, follower.rows] = np.linalg.norm(body.positions(x) + added - targets, axis=2)
     return SoftTissue(replace(motion, poses=pose.copy(), trans=trans.copy(), residuals=residuals,
-                              converged=motion.converged & (last < STILL)), changes, skin)
+                              converged=motion.converged & (last < STILL * size(body.body.template))), changes, skin)
 
 
 Whitening = Callable[[np.ndarray, np.ndarray], np.ndarray]
