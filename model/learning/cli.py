@@ -29,9 +29,11 @@ from scanprep.skeleton.tree import Skeleton
 
 from ..body import BodyModel
 from ..cli import about, read_bodies
+from ..digests import body_digests
 from ..files import BUILT_IN, load_model
 from ..fitting.search import ModelMismatchError
 from .config import LearnConfig
+from .large import Resolutions
 from .mixing import MIX, learn_scape_mix
 from .parts import choose_skeleton
 from .prior import TemplatePrior, bring_prior
@@ -56,7 +58,8 @@ def learn(poses: Path, output: Output, shapes: Path | None = None, template: Pat
 
     From few scans it is a known model, adapted: what they do not show, how joints bend and how people differ, is as
     there. One registered scan is enough. Killed and started again it goes on where it was; what does not depend on a
-    change is not learned again. A picture of the parts and one of the shape components lie beside the model.
+    change is not learned again. A picture of the parts and one of the shape components lie beside the model. From
+    60,000 vertices on it is learned on 20,000 and finished at full resolution.
 
     Example: scape learn --poses set --shapes set -o model.npz
 
@@ -106,6 +109,10 @@ def learn(poses: Path, output: Output, shapes: Path | None = None, template: Pat
     sexes = None if not by_sex or shapes is None else _read_sexes(shapes)
     marks = landmarks or poses / "landmarks.json"
     named = read_landmark_vertices(marks, body) if landmarks or marks.exists() else {}
+    # large meshes are learned on fewer vertices; the given bodies are only needed for their digests then
+    digests = body_digests(posed, people)
+    sizes = Resolutions(body)
+    body, posed, people = sizes.learned, sizes.reduce(posed), None if people is None else sizes.reduce(people)
     # a prior where poses or people are few, the skeleton where none is given, and the model
     step = KeptSteps(space)
     many = len(posed) >= ENOUGH
@@ -114,7 +121,7 @@ def learn(poses: Path, output: Output, shapes: Path | None = None, template: Pat
     known = _bring_prior(body, prior, step)
     # the poses of a prior show joints that few scans do not bend
     shown = None if known is None or many else known.poses[1:]
-    tree = None if shown is not None and skeleton is None else _read_skeleton(skeleton, poses, body)
+    tree = None if shown is not None and skeleton is None else _read_skeleton(skeleton, poses, sizes)
     if tree is None:
         if kind == "mixed":
             raise ValueError(f"{poses}: a mix of people shows no skeleton; name one with --skeleton")
@@ -127,17 +134,20 @@ def learn(poses: Path, output: Output, shapes: Path | None = None, template: Pat
             {"neutral": learn_blendscape(body, posed, people, tree, scape, *how, known)} if kind == "blendscape" else
             {"neutral": learn_skinning(body, posed, people, tree, skinning, *how)} if kind == "skinning" else
             {"neutral": learn_scape(body, posed, people, tree, scape, *how, known)})
+    with bar("finishing at full resolution") as progress:
+        models = sizes.finish(models, digests, progress)
     for name, model in models.items():
         path = output if name == "neutral" else output.with_suffix(f".{name}.npz")
         kept = dataclasses.replace(model, info={**model.info, "landmarks": named})     # type: ignore[type-var]
         kept.save(path)
         _draw(kept, path)
     return Outcome(output, [
-        *about(models["neutral"]), Metric("poses", len(posed)),
+        *about(models["neutral"]), Metric("poses", len(posed)), *_about_size(sizes),
         Metric("people", 0 if people is None else len(people)), Metric("parts of the skeleton", len(tree.parents)),
         *_about_prior(models["neutral"]),
         *[Metric(f"people of the {name} model", model.info["shapes"]) for name, model in models.items() if by_sex],
-        *details([Metric("kind", models["neutral"].kind), Metric("triangles", len(body.faces)), *_about_steps(step)])],
+        *details([Metric("kind", models["neutral"].kind), Metric("triangles", len(sizes.full.faces)),
+                  *_about_steps(step)])],
                    {"scape": scape, "skinning": skinning, "mixed": mixed},
                    judgement=judge_model(models["neutral"], people).merge(of_scans),
                    following=f"look at it: scape view {quote(str(output))}")
@@ -150,6 +160,12 @@ def _read_people(shapes: Path, body: Mesh, unit: Unit | None) -> np.ndarray:
         raise ValueError(f"shapes: expected at least 2 people, got {len(people)} in {shapes}; a model of the poses of "
                          "one person needs none")
     return people
+
+
+def _about_size(sizes: Resolutions) -> list[Metric]:
+    """Say on how many vertices large meshes were learned; no row for others."""
+    few, many = len(sizes.learned.vertices), len(sizes.full.vertices)
+    return [] if few == many else [Metric("learned on", f"{few} of {many} vertices")]
 
 
 def _about_steps(step: KeptSteps) -> list[Metric]:
@@ -217,15 +233,16 @@ def _read_sexes(folder: Path) -> list[str]:
     return [table.get(name, "") for name in names]
 
 
-def _read_skeleton(given: Path | None, poses: Path, body: Mesh) -> Skeleton | None:
+def _read_skeleton(given: Path | None, poses: Path, sizes: Resolutions) -> Skeleton | None:
+    """Read the skeleton of the template and bring it to the vertices that are learned on; None where there is none."""
     path = given or poses / "skeleton.json"
     if given is None and not path.exists():
         return None
     tree = Skeleton.load(path)
-    if len(tree.part_of_face) != len(body.faces):
-        raise ValueError(f"{path}: expected a skeleton of {len(body.faces)} triangles as the meshes have, "
+    if len(tree.part_of_face) != len(sizes.full.faces):
+        raise ValueError(f"{path}: expected a skeleton of {len(sizes.full.faces)} triangles as the meshes have, "
                          f"found {len(tree.part_of_face)}")
-    return tree
+    return sizes.reduce_skeleton(tree)
 
 
 def _draw(model: BodyModel, output: Path) -> None:
