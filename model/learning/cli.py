@@ -1,7 +1,6 @@
 """`scape learn`: a body model from registered meshes."""
 from __future__ import annotations
 
-import dataclasses
 import warnings
 from collections.abc import Mapping
 from pathlib import Path
@@ -110,12 +109,10 @@ def learn(poses: Path, output: Output, shapes: Path | None = None, template: Pat
     marks = landmarks or poses / "landmarks.json"
     named = read_landmark_vertices(marks, body) if landmarks or marks.exists() else {}
     # large meshes are learned on fewer vertices; the given bodies are only needed for their digests then
-    digests = body_digests(posed, people)
-    sizes = Resolutions(body)
+    digests, sizes = body_digests(posed, people), Resolutions(body)
     body, posed, people = sizes.learned, sizes.reduce(posed), None if people is None else sizes.reduce(people)
     # a prior where poses or people are few, the skeleton where none is given, and the model
-    step = KeptSteps(space)
-    many = len(posed) >= ENOUGH
+    step, many = KeptSteps(space), len(posed) >= ENOUGH
     if not with_prior or (prior == "auto" and many and people is not None and len(people) >= ENOUGH):
         prior = "none"
     known = _bring_prior(body, prior, step)
@@ -134,13 +131,11 @@ def learn(poses: Path, output: Output, shapes: Path | None = None, template: Pat
             {"neutral": learn_blendscape(body, posed, people, tree, scape, *how, known)} if kind == "blendscape" else
             {"neutral": learn_skinning(body, posed, people, tree, skinning, *how)} if kind == "skinning" else
             {"neutral": learn_scape(body, posed, people, tree, scape, *how, known)})
-    with bar("finishing at full resolution") as progress:
-        models = sizes.finish(models, digests, progress)
-    for name, model in models.items():
+    for name, model in _finish(sizes, models, digests).items():
         path = output if name == "neutral" else output.with_suffix(f".{name}.npz")
-        kept = dataclasses.replace(model, info={**model.info, "landmarks": named})     # type: ignore[type-var]
-        kept.save(path)
-        _draw(kept, path)
+        model.info["landmarks"] = named
+        model.save(path)
+        _draw(model, path)
     return Outcome(output, [
         *about(models["neutral"]), Metric("poses", len(posed)), *_about_size(sizes),
         Metric("people", 0 if people is None else len(people)), Metric("parts of the skeleton", len(tree.parents)),
@@ -160,6 +155,12 @@ def _read_people(shapes: Path, body: Mesh, unit: Unit | None) -> np.ndarray:
         raise ValueError(f"shapes: expected at least 2 people, got {len(people)} in {shapes}; a model of the poses of "
                          "one person needs none")
     return people
+
+
+def _finish(sizes: Resolutions, models: Mapping[str, BodyModel], digests: list[str]) -> dict[str, BodyModel]:
+    """Bring models that were learned on fewer vertices to all of them."""
+    with bar("finishing at full resolution") as progress:
+        return sizes.finish(models, digests, progress)
 
 
 def _about_size(sizes: Resolutions) -> list[Metric]:
