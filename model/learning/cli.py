@@ -3,6 +3,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from shlex import quote
 from typing import Annotated, Literal
@@ -110,7 +111,7 @@ def learn(poses: Path, output: Output, shapes: Path | None = None, template: Pat
     named = read_landmark_vertices(marks, body) if landmarks or marks.exists() else {}
     # large meshes are learned on fewer vertices; the given bodies are only needed for their digests then
     digests, sizes = body_digests(posed, people), Resolutions(body)
-    body, posed, people = sizes.learned, sizes.reduce(posed), None if people is None else sizes.reduce(people)
+    body, posed, people = sizes.learned, sizes.reduce(posed), people if people is None else sizes.reduce(people)
     # a prior where poses or people are few, the skeleton where none is given, and the model
     step, many = KeptSteps(space), len(posed) >= ENOUGH
     if not with_prior or (prior == "auto" and many and people is not None and len(people) >= ENOUGH):
@@ -131,9 +132,8 @@ def learn(poses: Path, output: Output, shapes: Path | None = None, template: Pat
             {"neutral": learn_blendscape(body, posed, people, tree, scape, *how, known)} if kind == "blendscape" else
             {"neutral": learn_skinning(body, posed, people, tree, skinning, *how)} if kind == "skinning" else
             {"neutral": learn_scape(body, posed, people, tree, scape, *how, known)})
-    for name, model in _finish(sizes, models, digests).items():
+    for name, model in _finish(sizes, models, digests, named).items():
         path = output if name == "neutral" else output.with_suffix(f".{name}.npz")
-        model.info["landmarks"] = named
         model.save(path)
         _draw(model, path)
     return Outcome(output, [
@@ -157,10 +157,13 @@ def _read_people(shapes: Path, body: Mesh, unit: Unit | None) -> np.ndarray:
     return people
 
 
-def _finish(sizes: Resolutions, models: Mapping[str, BodyModel], digests: list[str]) -> dict[str, BodyModel]:
-    """Bring models that were learned on fewer vertices to all of them."""
+def _finish(sizes: Resolutions, models: Mapping[str, BodyModel], digests: list[str], landmarks: dict[str, int]
+            ) -> dict[str, BodyModel]:
+    """Bring models that were learned on fewer vertices to all of them; they keep the landmarks of the template."""
     with bar("finishing at full resolution") as progress:
-        return sizes.finish(models, digests, progress)
+        finished = sizes.finish(models, digests, progress)
+    return {name: replace(model, info={**model.info, "landmarks": landmarks})            # type: ignore[type-var]
+            for name, model in finished.items()}
 
 
 def _about_size(sizes: Resolutions) -> list[Metric]:
