@@ -18,8 +18,12 @@ from .fitting.vertices import ShapeFit as ShapeFit
 from .fitting.vertices import fit_pose as fit_pose
 from .fitting.vertices import fit_shape as fit_shape
 from .importing import import_model as import_model
+from .learning.body import LearnedBody as LearnedBody
+from .learning.body import learn_body as learn_body
 from .learning.config import LearnConfig as LearnConfig
 from .learning.prior import bring_prior as bring_prior
+from .learning.parts import ChosenSkeleton as ChosenSkeleton
+from .learning.parts import choose_skeleton as choose_skeleton
 from .learning.scape import learn_blendscape as learn_blendscape
 from .learning.scape import learn_scape as learn_scape
 from .learning.skinning import SkinConfig as SkinConfig

@@ -3,6 +3,7 @@ from itertools import product
 
 import numpy as np
 import pytest
+from animal_bodies import Animal
 
 from scanprep.geometry import rotations
 from scanprep.geometry.mesh import Mesh
@@ -13,13 +14,13 @@ from scanprep.registration.graph_fit import start_fit
 from scanprep.registration.limbs import angle_excess, find_exchanged_sides, frames, limb_doubts, part_angles
 from scanprep.registration.matches import prepare_problem
 from scanprep.registration.nonrigid import Registration, measure_fit
-from scanprep.registration.person import PersonParts, average_person, person_parts
+from scanprep.registration.person import PersonParts, average_person, has_limbs, is_no_person, person_parts
 from scanprep.registration.repair import better, repair_limbs, roll_parts
 from scanprep.registration.rolls import CHANGE, LIMBS, STEPS, best_rolls, other_rolls, step
 from scanprep.registration.schedule import GraphStage, RegistrationConfig
 from scanprep.skeleton.tree import Skeleton
 from scanprep.synthetic.anatomy import MIRROR_PART
-from scanprep.synthetic.people import PARENTS, PARTS, find_pose
+from scanprep.synthetic.people import PARENTS, PARTS, BodyShape, SyntheticPerson, find_pose, random_pose
 
 FOREARM, SHIN, HEAD = (PARTS.index(name) for name in ("forearm_left", "shin_right", "head"))
 QUICK = RegistrationConfig((GraphStage(300, 0.09, 0.7, 0.01, 0.08, 0.0, rounds=3),
@@ -201,3 +202,28 @@ def test_the_search_for_parts_tells_how_far_it_is(person, monkeypatch):
     assert done == sorted(done) and told[0] == (0, 100) and told[-1] == (100, 100)
     assert person_parts(template, lambda *given: pytest.fail("sought again")) is found
     np.testing.assert_allclose(found.R_template_rest, np.broadcast_to(np.eye(3), (len(PARTS), 3, 3)), atol=1e-6)
+
+
+def test_an_animal_is_known_for_no_person_without_a_search(monkeypatch):
+    monkeypatch.setattr(person_module, "find_seeds", lambda *given: pytest.fail("a person was sought"))
+    animal = Animal().mesh
+    assert is_no_person(animal) and not has_limbs(animal) and person_parts(animal) is None
+
+
+def test_no_person_is_refused_short_or_tall_thin_or_heavy_in_any_pose():
+    rng = np.random.default_rng(3)
+    people = [SyntheticPerson(BodyShape.like("female", 1.2, 6.0)), SyntheticPerson(BodyShape.like("male", 2.1, -4.0)),
+              *(SyntheticPerson(BodyShape.random(rng)) for _ in range(3))]
+    bodies = [person.mesh.with_vertices(person.in_pose(random_pose(rng))) for person in people]
+    assert not any(is_no_person(body) for body in bodies)
+
+
+def test_a_surface_with_a_handle_is_not_judged():
+    # a handle as of a hand that is one with the hip: two triangles far apart are cut out and joined by a tube
+    mesh = Animal().mesh
+    centres = mesh.corners.mean(axis=1)
+    far = int(np.linalg.norm(centres - centres[0], axis=1).argmax())
+    a, b = mesh.faces[0], mesh.faces[far][::-1]
+    tube = [side for k in range(3) for side in ([a[k], a[k - 2], b[k]], [a[k - 2], b[k - 2], b[k]])]
+    joined = Mesh(mesh.vertices, np.vstack([np.delete(mesh.faces, [0, far], axis=0), tube]))
+    assert not len(joined.boundary_loops) and not is_no_person(joined)

@@ -8,11 +8,12 @@ from scipy.spatial import cKDTree
 
 from scanprep.batch.room import Step, run_uncached
 from scanprep.decimation.decimate import decimate
-from scanprep.geometry.mesh import Mesh
+from scanprep.geometry.mesh import Mesh, take_any_mesh
 from scanprep.skeleton.parts import SkeletonConfig
 from scanprep.skeleton.restarts import SkeletonFinder
 from scanprep.skeleton.tree import Skeleton
 from scanprep.threads import one_thread
+from scanprep.words import describe_result
 
 from ..blending import BlendedTemplate, rigid_weights
 from ..human_poses import is_person
@@ -45,6 +46,7 @@ class ChosenSkeleton:
     errors: dict[int, float]
     tied: bool
     other_error: float
+    __repr__ = describe_result
 
     @property
     def error(self) -> float:
@@ -59,6 +61,7 @@ class ChosenSkeleton:
         return min(level), max(level)
 
 
+@take_any_mesh
 @one_thread()
 def choose_skeleton(template: Mesh, poses: np.ndarray, progress: Progress | None = None, step: Step = run_uncached,
                     known: np.ndarray | None = None) -> ChosenSkeleton:

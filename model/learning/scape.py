@@ -17,6 +17,7 @@ from scanprep.geometry.mesh import Mesh, check_template, take_any_mesh
 from scanprep.geometry.rotations import procrustes
 from scanprep.geometry.upright import find_up
 from scanprep.judgement import HAND, Judgement, extent, size, unit_problem
+from scanprep.skeleton.joints import joint_doubts
 from scanprep.skeleton.names import skeleton_doubts
 from scanprep.skeleton.roles import joint_in_words
 from scanprep.skeleton.tree import Skeleton
@@ -500,6 +501,7 @@ def judge_model(model: BodyModel, people: np.ndarray | None = None) -> Judgement
     elif len(model.skeleton.parents) == 1 and model.n_betas:
         doubts = ["the body has one part and no joint: it takes no pose"]
     doubts = spikes + doubts + skeleton_doubts(model.skeleton)
+    doubts += joint_doubts(model.skeleton, model.info.get("joint_gaps", ()))
     error, body_size = model.info.get("left_out_error", 0.0), size(model.template)
     distance = model.info.get("pose_distance", 0.0)             # not known of imported and older models
     # with a prior, larger errors (shares of the size) on left-out poses point to wrong meshes. One man's poses have 12

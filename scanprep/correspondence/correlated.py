@@ -114,7 +114,7 @@ def find_seeds(template: Mesh, scan: Mesh | np.ndarray, ends: int = 5, hypothese
     if len(template_ends) < 3:
         raise ValueError(f"template: expected at least three limbs, found {len(template_ends)} ends")
     sheet = Sheet(target_of(scan), TRIAL.spacing * size)
-    scan_ends, scan_paths = _ends(sheet.points, sheet.distances, ends + 2, apart * size)
+    scan_ends, scan_paths = find_path_ends(sheet.points, sheet.distances, ends + 2, apart * size)
     if len(scan_ends) < 3:
         raise ValueError(f"scan: expected at least three ends of limbs, found {len(scan_ends)}")
     matches = match_ends(template_paths[:, template_ends], scan_paths[:, scan_ends], hypotheses)
@@ -146,14 +146,17 @@ def _surface(template: Mesh) -> SurfaceGraph:
 @lru_cache(maxsize=4)
 def _template_ends(template: Mesh, count: int, apart: float) -> tuple[np.ndarray, np.ndarray]:
     """Find the ends of a template (E,), and the path lengths (E, N), metres, from them to all vertices."""
-    return _ends(template.vertices, _surface(template).distances, count, apart)
+    return find_path_ends(template.vertices, _surface(template).distances, count, apart)
 
 
-def _ends(points: np.ndarray, distances: Callable[[np.ndarray], np.ndarray], count: int, apart: float
-          ) -> tuple[np.ndarray, np.ndarray]:
-    """Find local maxima (E,) of the mean path length, highest first, and path lengths (E, n) to all points."""
-    # mean path length from every point to 64 spread points: large at the ends of limbs
-    sample = farthest_points(points, 64)
+def find_path_ends(points: np.ndarray, distances: Callable[[np.ndarray], np.ndarray], count: int, apart: float,
+                   samples: int = 64) -> tuple[np.ndarray, np.ndarray]:
+    """Find local maxima (E,) of the mean path length, highest first, and path lengths (E, n) to all points.
+
+    The mean is over the paths to as many `samples`, spread over the body; maxima are at least `apart`, metres.
+    """
+    # mean path length from every point to spread points: large at the ends of limbs
+    sample = farthest_points(points, samples)
     ways = distances(sample)
     there = np.isfinite(ways)
     mean = np.full(ways.shape[1], np.nan)                     # stays NaN on pieces without a sample

@@ -347,12 +347,14 @@ class Registered(NamedTuple):
 def read_registered(folder: str | Path, unit: str | None = None) -> Registered:
     """Read all meshes of a folder or RegisteredSet, sorted by name; MeshFileError for different triangles."""
     paths = list_meshes(folder)
-    unit, meshes = common_unit(paths, unit), []
-    for path in paths:
-        meshes.append(read_mesh(path, unit))
-        check_same_topology(path, meshes[-1], paths[0], meshes[0])
-    return Registered(meshes[0].faces, np.stack([m.vertices for m in meshes]),
-                      tuple(map(name_of, paths)), meshes[0].up)
+    unit = common_unit(paths, unit)
+    first = read_mesh(paths[0], unit)
+    vertices = np.empty((len(paths), *first.vertices.shape))
+    for place, path in zip(vertices, paths, strict=True):        # of large meshes only the vertices are kept
+        mesh = first if path == paths[0] else read_mesh(path, unit)
+        check_same_topology(path, mesh, paths[0], first)
+        place[:] = mesh.vertices
+    return Registered(first.faces, vertices, tuple(map(name_of, paths)), first.up)
 
 
 def check_same_topology(path: Path, mesh: Mesh, first_path: Path, first: Mesh) -> None:

@@ -8,18 +8,29 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
+from itertools import permutations
 from weakref import WeakKeyDictionary
 
 import numpy as np
 
-from ..correspondence.correlated import find_correspondences, find_seeds
+from ..correspondence.correlated import find_correspondences, find_path_ends, find_seeds
 from ..geometry.format_glb import tallest
+from ..geometry.geodesics import SurfaceGraph
 from ..geometry.mesh import Mesh
 from ..geometry.surface import Surface
 from ..skeleton.tree import Skeleton
 from ..synthetic.people import PARENTS, PARTS, SyntheticPerson
 from .nonrigid import Registration, register, share_stretched
 from .schedule import RegistrationConfig
+
+# Log ratios of the ten paths between head, two hands and two feet to those of the average person, apart from the common
+# scale: their ranges over 71 SCAPE poses, 57 SPRING people and 124 synthetic ones, from 1.2 to 2.1 m and thin to heavy.
+# In turn: head to hands, head to feet, hand to hand, hands to feet, foot to foot.
+LEAST = np.array([-0.216] * 2 + [-0.049] * 2 + [-0.251] + [-0.062] * 4 + [-0.145])
+MOST = np.array([0.071] * 2 + [0.141] * 2 + [0.063] + [0.167] * 4 + [0.093])
+# How far outside them a body is no person. The ten people of TOSCA lie up to 0.023 outside, gorillas from 0.118 on.
+# None of the 262 people has a sixth end. Horses, cats, dogs, camels and cows have one, and lie from 0.042 on outside.
+BEYOND, BEYOND_WITH_TAIL = 0.1, 0.02
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,11 +93,57 @@ def _find_parts(template: Mesh, report_progress: Callable[[int, int], None]) -> 
 
 
 def has_limbs(template: Mesh) -> bool:
-    """Test whether a template has five limb ends, as the head, hands and feet of a person."""
+    """Test whether a template has five limb ends, as the head, hands and feet of a person, in a person's proportions.
+
+    What is surely no person is told in less than a second, most animals among it.
+    """
+    if is_no_person(template):
+        return False
     try:
         return len(find_seeds(average_person().mesh, template)) >= 5
     except ValueError:             # it has too few ends of limbs
         return False
+
+
+def is_no_person(template: Mesh) -> bool:
+    """Test whether the paths along the surface between the ends of limbs are surely not those of a person.
+
+    Posing hardly changes these paths. False where they tell nothing: fewer than five ends, or a surface with handles,
+    as of hands that are one with the hips.
+    """
+    V, E, F = len(template.vertices), len(template.edges), len(template.faces)
+    if V - E + F + len(template.boundary_loops) < 2:
+        return False
+    paths = _limb_paths(template)
+    if len(paths) < 5:
+        return False
+    # log ratios to the average person, apart from the common scale, of every choice of head, hands and feet
+    choices = np.array(list(permutations(range(len(paths)), 5)))
+    a, b = np.triu_indices(5, 1)
+    ratio = np.log(paths[choices[:, a], choices[:, b]] / _paths_of_person()[a, b])
+    ratio -= ratio.mean(axis=1, keepdims=True)
+    beyond = np.maximum(LEAST - ratio, ratio - MOST).max(axis=1).min()
+    # people have no sixth end; what has one, such as a tail, may lie less far beyond their ranges
+    return bool(beyond > (BEYOND if len(paths) == 5 else BEYOND_WITH_TAIL))
+
+
+@lru_cache(maxsize=4)
+def _limb_paths(template: Mesh) -> np.ndarray:
+    """Compute path lengths (E, E) between at most seven ends of a template, in units of √area."""
+    size = float(np.sqrt(template.face_areas.sum()))
+    # ends as of `find_seeds`; 16 samples find those of 64, in a third of the time
+    ends, paths = find_path_ends(template.vertices, SurfaceGraph(template).distances, 7, 0.28 * size, 16)
+    return paths[:, ends] / size
+
+
+@lru_cache(maxsize=1)
+def _paths_of_person() -> np.ndarray:
+    """Compute path lengths (5, 5) between head, hands and feet of the average person."""
+    person = average_person()
+    size = float(np.sqrt(person.mesh.face_areas.sum()))
+    ends, paths = find_path_ends(person.mesh.vertices, SurfaceGraph(person.mesh).distances, 5, 0.28 * size, 16)
+    order = np.argsort(person.part_of_vertex[ends])
+    return paths[order][:, ends[order]] / size
 
 
 def _person_on(template: Mesh, report_progress: Callable[[int, int], None]) -> Registration | None:

@@ -16,6 +16,7 @@ from ..geometry.mesh import Mesh
 from ..judgement import Judgement
 from .edit import apply_edits, read_edits
 from .find import search_skeleton, skeleton_problem
+from .joints import joint_doubts, joint_gaps
 from .names import note_numbered_parts, skeleton_doubts
 from .parts import SkeletonConfig
 from .tree import Skeleton

@@ -4,6 +4,7 @@ Parts that only blend between two neighbours are dissolved, loops are opened, an
 """
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -17,6 +18,9 @@ from .parts import FADING, PartSearch
 from .sides import mirror_pairs, reductions
 from .tree import Skeleton
 
+# Joints whose parts carry them apart by more than this times the radius of their border are doubtful. Shoulders of people
+# whose collar bones are in the chest have 0.9, other joints of people at most 0.3.
+LOOSE = 1.0
 LOOP_SEPARATION = 1.5            # in a loop, parts less than this times the separation apart are merged
 
 
@@ -315,6 +319,14 @@ def joint_gaps(template: Mesh, poses: np.ndarray, skeleton: Skeleton) -> np.ndar
         apart = (motions.R[a] - motions.R[b]) @ place + motions.t[a] - motions.t[b]
         gaps[a] = np.sqrt((apart**2).sum(axis=1).mean()) / radius
     return gaps
+
+
+def joint_doubts(skeleton: Skeleton, gaps: Sequence[float]) -> list[str]:
+    """Name the joints whose two parts do not carry them to one place, by their `joint_gaps` (J,), as reasons."""
+    loose = [f"{skeleton.names[j]} to {skeleton.names[skeleton.parents[j]]}" for j in range(1, len(gaps))
+             if gaps[j] > LOOSE]
+    return [f"no point holds these parts together, so they may belong elsewhere in the tree: {', '.join(loose)}; "
+            "correct it with scape prep edit-skeleton, or add scans in which the body bends there"] if loose else []
 
 
 def _meeting_point(dR: np.ndarray, gap: np.ndarray, radius: float) -> np.ndarray:
