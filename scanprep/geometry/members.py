@@ -13,9 +13,10 @@ ONE_BODY, ONE_KIND = 1.15, 3.0
 # Vertices in another order make more than this share of the edges twice or half as long: 12% or more even where each is
 # exchanged for the next one. SCAPE, SPRING, animals and a hand of four fingers have at most 2%.
 ANOTHER_ORDER, FACTOR = 0.08, 2.0
-# Handedness: SCAPE, SPRING, animals and the hand have 0.5 to 1, their mirror images the negative of it, vertices in
-# another order -0.1 to 0.3. Averages over 6 rings leave the sign where noise is as long as an edge.
-MIRRORED, KEPT, RINGS = -0.2, 0.4, 6
+# Handedness: SCAPE, SPRING, animals and the hand have 0.5 to 1, people of three standard deviations in each component
+# 0.36 or more, mirror images the negative of it, vertices in another order -0.2 to 0.2. Averages over 6 rings keep the
+# sign where noise is as long as an edge.
+MIRRORED, KEPT, RINGS = -0.2, 0.3, 6
 # A torn edge is more than four times as long as in the others, by more than a tenth of the size (root of the area), 14
 # cm on a man. SCAPE and SPRING have up to 6%, where an armpit was registered to the wrong side. A share of 3% of the
 # edges is no spike any more: each of these has some six.
