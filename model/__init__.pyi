@@ -21,9 +21,9 @@ from .importing import import_model as import_model
 from .learning.body import LearnedBody as LearnedBody
 from .learning.body import learn_body as learn_body
 from .learning.config import LearnConfig as LearnConfig
-from .learning.prior import bring_prior as bring_prior
 from .learning.parts import ChosenSkeleton as ChosenSkeleton
 from .learning.parts import choose_skeleton as choose_skeleton
+from .learning.prior import bring_prior as bring_prior
 from .learning.scape import learn_blendscape as learn_blendscape
 from .learning.scape import learn_scape as learn_scape
 from .learning.skinning import SkinConfig as SkinConfig

@@ -8,12 +8,13 @@ from functools import cached_property
 import numpy as np
 
 from scanprep.decimation.decimate import decimate
+from scanprep.geometry.carrier import SurfaceCarrier, mount
 from scanprep.geometry.mesh import Mesh, check_template
 from scanprep.skeleton.tree import Skeleton
 
 from ..body import BodyModel, Progress
 from ..resolution.change import ResolutionConfig, change_resolution
-from ..resolution.transfer import SurfaceCarrier, mount, transfer_skeleton
+from ..resolution.transfer import transfer_skeleton
 
 LARGE = 60_000                       # vertices from which on learning takes more than 1 GB
 # Vertices that are then learned on. Held-out SCAPE poses of 50,000 vertices are 8.81 mm off, learned on 25,000 of them

@@ -53,7 +53,8 @@ def skeleton(poses: Annotated[Path, Place("POSES")], output: Output, template: P
           for loop in search.loops), *_shares(found, body)], {"skeleton": config},
                    judgement=Judgement.of(skeleton_problem(search, config.parts),
                                           [*find_spikes(body, vertices, str(poses), names),
-                                           *skeleton_doubts(found, config.parts)]))
+                                           *skeleton_doubts(found, config.parts),
+                                           *joint_doubts(found, joint_gaps(body, vertices, found).tolist())]))
 
 
 def edit(skeleton: Annotated[Path, Place("SKELETON")], output: Output, template: Path | None = None,
