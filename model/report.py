@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 
 from scanprep.geometry.mesh import Mesh
+from scanprep.judgement import size
 from scanprep.pictures.camera import look_around
 from scanprep.pictures.scene import Pane, picture_panes
 from scanprep.pictures.shading import Bones, Dots, Shape, Solid, part_colors
@@ -18,8 +19,9 @@ def parts_panes(template: Mesh, skeleton: Skeleton) -> list[Pane]:
     """Draw the parts in colour, then joints and bones inside a transparent body."""
     camera, = look_around(template, turns=(15,))
     joints, child = skeleton.joints, np.arange(1, len(skeleton.joints))
-    inside: list[Shape] = [Solid(template, opacity=0.35), Dots(joints, radius=0.014, on_top=True),
-                           Bones(joints[skeleton.parents[child]], joints[child], on_top=True)]
+    ball = 0.01 * size(template)                                    # 14 mm on a man, 2 mm in a hand
+    inside: list[Shape] = [Solid(template, opacity=0.35), Dots(joints, radius=ball, on_top=True),
+                           Bones(joints[skeleton.parents[child]], joints[child], radius=0.4 * ball, on_top=True)]
     return [Pane([Solid(template, part_colors(skeleton.part_of_face))], camera, f"{len(skeleton.parents)} parts"),
             Pane(inside, camera, "joints")]
 

@@ -10,6 +10,7 @@ import numpy as np
 from scanprep.console import Metric
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.surface import Surface
+from scanprep.judgement import size
 from scanprep.pictures.camera import Camera
 from scanprep.pictures.page import Page
 from scanprep.pictures.scene import Pane, picture_panes
@@ -70,7 +71,7 @@ def statue_page(name: str, scan: Mesh, statue: Statue, levels: Sequence[Level], 
     page.bodies([Pane([
         thin_solid(Solid(Mesh(scan.vertices, scan.faces), opacity=0.35, name="scan"), MOVED),
         Bones(joints[control.skeleton.parents[1:]], joints[1:], on_top=True, name="skeleton"),
-        Dots(joints, on_top=True, name="joints", labels=control.skeleton.names),
+        Dots(joints, radius=0.0085 * size(control.mesh), on_top=True, name="joints", labels=control.skeleton.names),
         Dots(control.mesh.vertices[marks], (0.15, 0.45, 0.75), 0.006, True, name="feature points", labels=names)],
                       cameras(statue, scan, (20,))[0])], height=HEIGHT)
     page.section("Displacement map", "White: the scan lies outside the control mesh, black: inside. Right: blue was "
