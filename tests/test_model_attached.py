@@ -6,7 +6,7 @@ import pytest
 from glb_reader import Glb
 
 from completion.__main__ import main
-from completion.partial.completion import Completion, load_completion, save_completion
+from completion.partial.completion import Completion, load_completion
 from model import load_built_in_model, load_model
 from model.resolution.change import ResolutionConfig, change_resolution, resample
 from scanprep import Mesh, read_mesh, write_mesh
@@ -56,7 +56,7 @@ def learned(tmp_path_factory):
 
 
 def test_the_largest_component_is_the_body(learned):
-    body, posed = read_poses(learned / "poses", None, None, "m")
+    body, posed, _ = read_poses(learned / "poses", None, None, "m")
     assert np.array_equal(body.faces, MODEL.template.faces) and posed.shape == (6, *MODEL.template.vertices.shape)
     assert np.array_equal(posed[0], MODEL.template.vertices) and template_problem(body) is None
     report = (learned / "model.npz.report.json").read_text()
@@ -132,7 +132,7 @@ def test_a_completion_is_read_again(tmp_path):
     seen = np.ones(len(body.vertices), dtype=bool)
     done = Completion(moved, moved, np.zeros((16, 3)), None, np.zeros(3), seen, 0.001,
                       0.98, 0.004, True, 12)
-    folder = save_completion(tmp_path / "done", done)
+    folder = done.save(tmp_path / "done")
     assert np.abs(read_mesh(folder / "completed.ply", "m").vertices - WHOLE.vertices - 0.1).max() < 1e-6
     assert np.array_equal(load_completion(folder).completed.vertices, moved.vertices)
 

@@ -84,7 +84,7 @@ def test_what_was_said_about_the_scans_holds_for_the_model(folder, tmp_path, ver
 
 def test_one_person_alone_shows_no_shapes(folder, tmp_path, monkeypatch):
     """It took as long as the skeleton takes to say so."""
-    monkeypatch.setattr("model.learning.cli._find_skeleton", None)
+    monkeypatch.setattr("model.learning.body.choose_skeleton", None)
     write_mesh(tmp_path / "one" / "anna.ply", RegisteredSet.load(folder / "set").template)
     with pytest.raises(ValueError, match="shapes: expected at least 2 people, got 1 in"):
         learned(folder / "poses", tmp_path / "m.npz", tmp_path / "one")

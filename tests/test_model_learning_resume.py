@@ -3,7 +3,6 @@ import shutil
 import subprocess
 import sys
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -11,14 +10,15 @@ from config_files import config_file
 from model_bodies import random_poses, worm_model
 
 from model import load_model, report
-from model.learning import cli, mixing, parts, scape, skinning
+from model.learning import body, cli, mixing, parts, scape, skinning
 from model.learning.cli import learn
+from model.learning.parts import ChosenSkeleton
 from scanprep import read_mesh, write_mesh
 from scanprep.batch.opening import beside
 from scanprep.command_line import run
 from scanprep.skeleton import restarts
 
-STAGES = {"skeleton": (cli, "choose_skeleton"), "poses": (scape, "by_edges"), "people": (scape, "shape_gradients"),
+STAGES = {"skeleton": (body, "choose_skeleton"), "poses": (scape, "by_edges"), "people": (scape, "shape_gradients"),
           "components": (scape, "learn_shape_space"), "pictures": (cli, "_draw")}
 QUICK = {"refinements": 1, "components": 4, "prunings": [0.01], "ridges": [1e-3]}
 SKIN = {"rounds": 2, "components": 4}
@@ -56,8 +56,8 @@ def bodies(tmp_path):
     truth, rng = worm_model(), np.random.default_rng(0)
     poses = random_poses(truth, 8, rng, 0.4)
     poses[0] = 0
-    for i, body in enumerate(truth.subject().vertices(poses)):
-        write_mesh(tmp_path / "poses" / f"pose{i}.ply", truth.template.with_vertices(body))
+    for i, vertices in enumerate(truth.subject().vertices(poses)):
+        write_mesh(tmp_path / "poses" / f"pose{i}.ply", truth.template.with_vertices(vertices))
     for i in range(6):
         body = truth.vertices(random_poses(truth, 1, rng, 0.1)[0], rng.normal(size=3))
         write_mesh(tmp_path / "people" / f"person{i}.ply", truth.template.with_vertices(body))
@@ -84,7 +84,8 @@ def counted(monkeypatch):
 @pytest.fixture
 def searched(monkeypatch):
     """A search for a skeleton that takes no time, for words without --skeleton."""
-    monkeypatch.setattr(cli, "choose_skeleton", lambda *given: SimpleNamespace(skeleton=worm_model().skeleton))
+    chosen = ChosenSkeleton(worm_model().skeleton, {4: 0.001}, False, np.nan)
+    monkeypatch.setattr(body, "choose_skeleton", lambda *given: chosen)
 
 
 def words(bodies, output, *more, search=False, **settings):
@@ -158,8 +159,8 @@ def test_every_kind_goes_on(bodies, kind, module, name, after):
 def test_the_search_for_a_skeleton_goes_on(tmp_path, monkeypatch):
     truth = worm_model(rings=17)
     bodies = truth.subject().vertices(random_poses(truth, 5, np.random.default_rng(0), 0.4))
-    for i, body in enumerate(bodies):
-        write_mesh(tmp_path / "poses" / f"pose{i}.ply", truth.template.with_vertices(body))
+    for i, vertices in enumerate(bodies):
+        write_mesh(tmp_path / "poses" / f"pose{i}.ply", truth.template.with_vertices(vertices))
 
     def given(name):
         return ["--poses", str(tmp_path / "poses"), "-o", str(tmp_path / name),
@@ -167,11 +168,13 @@ def test_the_search_for_a_skeleton_goes_on(tmp_path, monkeypatch):
 
     assert run(learn, "scape learn", given("a.npz")) == 0
     killed(restarts, "_search", 1, given("b.npz"))                              # after the first restart
-    killed(parts, "_leave_out_error", 0, given("b.npz"))                           # after the last
-    killed(parts, "_try_parts", 1, given("b.npz"))                                    # before more parts are tried
-    tried, real = [], parts._try_parts
-    monkeypatch.setattr(parts, "_try_parts", lambda *given: tried.append(given[1]) or real(*given))
-    monkeypatch.setattr(restarts, "_search", lambda search: pytest.fail("searched again"))
+    killed(parts, "PartsSearch._predict_left_out", 0, given("b.npz"))                           # after the last
+    killed(parts, "PartsSearch._try", 1, given("b.npz"))                              # before more parts are tried
+    search = restarts._search
+    tried, real = [], parts.PartsSearch._try
+    monkeypatch.setattr(parts.PartsSearch, "_try", lambda *given: tried.append(given[3]) or real(*given))
+    monkeypatch.setattr(restarts, "_search",
+                        lambda one: pytest.fail("searched again") if one.sides.tied else search(one))
     assert run(learn, "scape learn", given("b.npz")) == 0
     assert (tmp_path / "a.npz").read_bytes() == (tmp_path / "b.npz").read_bytes()
     assert tried and all(wanted is not None for wanted in tried)
@@ -272,8 +275,8 @@ def test_a_mix_goes_on(tmp_path):
     whole = RegisteredSet.create(tmp_path / "set", truth.template)
     for person in range(3):
         subject = truth.subject(rng.normal(size=3))
-        for i, body in enumerate(subject.vertices(random_poses(truth, 4, rng, 0.3))):
-            whole = whole.add(f"p{person}_{i}", body, subject=f"p{person}")
+        for i, vertices in enumerate(subject.vertices(random_poses(truth, 4, rng, 0.3))):
+            whole = whole.add(f"p{person}_{i}", vertices, subject=f"p{person}")
     whole.with_skeleton(truth.skeleton)
     file = config_file(tmp_path, mixed={"refinements": 3, "components": 2})
     given = ["--poses", str(tmp_path / "set"), "--kind", "mixed", "--config", str(file)]

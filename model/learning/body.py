@@ -52,6 +52,12 @@ class LearnedBody:
         Number of vertices that the model was learned on; fewer than the template's of large meshes.
     people : (S, N, 3) float, metres, optional
         The shapes that were learned.
+
+    Examples
+    --------
+    >>> from model import load_built_in_model
+    >>> LearnedBody({"neutral": load_built_in_model()}, None, 1500, None).judgement.verdict
+    'good'
     """
 
     models: dict[str, BodyModel]

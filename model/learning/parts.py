@@ -40,6 +40,16 @@ class ChosenSkeleton:
         Whether left and right have the same parts by construction.
     other_error : float, metres
         Least error of left-out poses with sides the other way; NaN where they were not tried.
+
+    Examples
+    --------
+    Beyond 12 parts nothing is gained, with 16 nothing lost:
+
+    >>> from scanprep.synthetic.topology import load_topology
+    >>> mesh = load_topology().mesh
+    >>> whole = Skeleton(np.zeros(len(mesh.faces), dtype=int), [-1], mesh.vertices.mean(axis=0)[None])
+    >>> ChosenSkeleton(whole, {8: 0.014, 12: 0.0101, 16: 0.01}, True, np.nan).as_good
+    (12, 16)
     """
 
     skeleton: Skeleton
@@ -165,7 +175,7 @@ class PartsSearch:
         def make() -> tuple[Skeleton, float] | None:
             try:
                 skeleton = finder.skeleton(finder.runs[0] if parts is None else finder.first, parts)[0]
-                return skeleton, self._left_out_error(coarse_skeleton(skeleton, self.template, self.coarse))
+                return skeleton, self._predict_left_out(coarse_skeleton(skeleton, self.template, self.coarse))
             except ValueError:
                 if parts is None:
                     raise
@@ -175,7 +185,7 @@ class PartsSearch:
         inputs = self.template, self.poses, settings, parts, QUICK, self.COARSE, self.known
         return self.step(name, inputs, make)
 
-    def _left_out_error(self, skeleton: Skeleton) -> float:
+    def _predict_left_out(self, skeleton: Skeleton) -> float:
         """Compute the mean vertex error, metres, of left-out poses of the coarse bodies."""
         parts, prior = BlendedTemplate(self.coarse, skeleton, rigid_weights(skeleton)), None
         poses = self.poses[:, self.vertices]

@@ -131,6 +131,7 @@ def learn_scape(template: Mesh, poses: np.ndarray, shapes: np.ndarray | None, sk
 
     [SCAPE] Eq. 4, Eq. 5, Eq. 7, Eq. 8
     """
+    poses, shapes = check_training(template, skeleton, poses, shapes, prior)
     template = find_up(template, poses)
     parts = BlendedTemplate(template, skeleton, rigid_weights(skeleton))                   # R of each part
     return ScapeModel(template, skeleton,
@@ -187,7 +188,8 @@ def learn_blendscape(template: Mesh, poses: np.ndarray, shapes: np.ndarray | Non
 
     [BlendSCAPE]
     """
-    check_training(template, skeleton, poses, shapes, prior)
+    poses, shapes = check_training(template, skeleton, poses, shapes, prior)
+    template = find_up(template, poses)
     # rotations blend over 1% of the template's diagonal on each side of a border
     blend = face_weights(template, skeleton, 0.01 * float(np.linalg.norm(np.ptp(template.vertices, axis=0))))
     parts = BlendedTemplate(template, skeleton, blend)
@@ -199,7 +201,6 @@ def _learn_spaces(parts: BlendedTemplate, poses: np.ndarray, shapes: np.ndarray 
                   work: ProgressShares, prior: TemplatePrior | None) -> dict[str, Any]:
     """Learn pose space, shape space, pose prior and info of a SCAPE or BlendSCAPE model."""
     config = config or LearnConfig()
-    poses, shapes = check_training(parts.template, parts.skeleton, poses, shapes, prior)
     learned = learn_pose_with(prior, parts, poses, config, work)                           # [SCAPE] Eq. 3, Eq. 4, Eq. 5
     people = learn_people(parts, learned.space, shapes, config, work, prior)               # [SCAPE] Eq. 7, Eq. 8
     return {"pose_space": learned.space, "shape_space": people,
