@@ -9,6 +9,7 @@ from scipy.spatial import cKDTree
 from scanprep.batch.room import Step, run_uncached
 from scanprep.decimation.decimate import decimate
 from scanprep.geometry.mesh import Mesh, take_any_mesh
+from scanprep.judgement import size
 from scanprep.skeleton.parts import SkeletonConfig
 from scanprep.skeleton.restarts import SkeletonFinder
 from scanprep.skeleton.tree import Skeleton
@@ -25,6 +26,7 @@ MORE, TRIES = 4, 10                  # parts added at each try, and most tries
 # More parts cost time and names, so they must lower the left-out error: by 3% up to 20 parts, as many as people have,
 # and in proportion beyond. Without that an animal of 12 bones got 44 parts.
 GAIN, USUAL = 0.03, 20
+FINE = 0.003                         # of the body's size, 4 mm on a man: as exact as scans are registered, and enough
 VAIN = 2                             # tries in a row without such a gain end the search
 
 
@@ -81,9 +83,9 @@ def choose_skeleton(template: Mesh, poses: np.ndarray, progress: Progress | None
 
     The search for rigid parts stops where surfaces no longer meet in a joint. But trunk and shoulders bend without
     joints, and need more parts. So finer skeletons are found from the same restarts, and a model is learned with each
-    on a coarse copy of the bodies. They are kept while the error of left-out poses falls, and while a person's parts
-    can be named. On a body with two sides, skeletons with the same parts left and right compete with free ones; those
-    of a person stay alike.
+    on a coarse copy of the bodies. They are kept while the error of left-out poses falls and is not yet as small as
+    that of registration, and while a person's parts can be named. On a body with two sides, skeletons with the same
+    parts left and right compete with free ones; those of a person stay alike.
 
     Parameters
     ----------
@@ -152,20 +154,18 @@ class PartsSearch:
         first = self._try(finder, settings, None)
         assert first is not None, "what goes wrong without a count of parts is raised"
         best, least = first
-        errors, vain = {len(best.parents): least}, 0
-        for done in range(1, 1 + TRIES):
-            wanted = len(best.parents) + MORE * (1 + vain)
+        errors, vain, tries = {len(best.parents): least}, 0, 0
+        fine = FINE * size(self.template)
+        while tries < TRIES and vain < VAIN and least > fine:
+            wanted, tries, vain = len(best.parents) + MORE * (1 + vain), tries + 1, vain + 1
             finer = self._try(finder, settings, wanted)
-            self.report_progress(before + settings.restarts + done, self.whole)
+            self.report_progress(before + settings.restarts + tries, self.whole)
             # the pose prior of people needs the names of parts, which a finer skeleton may lose
-            usable = finer is not None and (is_person(finer[0]) or not is_person(best))
-            if finer is not None and usable:
-                errors.setdefault(len(finer[0].parents), finer[1])
-            vain += 1
-            if finer is not None and usable and finer[1] <= (1 - GAIN * max(1, wanted / USUAL)) * least:
+            if finer is None or (is_person(best) and not is_person(finer[0])):
+                continue
+            errors.setdefault(len(finer[0].parents), finer[1])
+            if finer[1] <= (1 - GAIN * max(1, wanted / USUAL)) * least:
                 (best, least), vain = finer, 0
-            if vain == VAIN:
-                break
         return ChosenSkeleton(best, errors, finder.runs[0].search.sides.tied, np.nan)
 
     def _try(self, finder: SkeletonFinder, settings: SkeletonConfig, parts: int | None
