@@ -10,8 +10,10 @@ from hand_bodies import KNUCKLES, bend_fingers, hand
 from scanprep.geometry import rotations
 from scanprep.geometry.mesh import Mesh, check_template
 from scanprep.skeleton.find import find_skeleton
+from scanprep.skeleton.joints import spanning_links
+from scanprep.skeleton.motions import PosedSurface
 from scanprep.skeleton.names import skeleton_doubts
-from scanprep.skeleton.parts import SkeletonConfig
+from scanprep.skeleton.parts import PartSearch, SkeletonConfig
 from scanprep.skeleton.tree import Skeleton
 
 CELL = 0.04
@@ -240,6 +242,19 @@ def test_a_template_in_two_pieces_is_refused(figure: Figure, poses: np.ndarray) 
 def test_bad_settings_are_refused_by_name(name: str, value: float) -> None:
     with pytest.raises(ValueError, match=name):
         replace(SkeletonConfig(), **{name: value})
+
+
+def test_links_in_loops_go_where_the_joint_fits_worst():
+    """Of the links of a hand, those between neighbouring fingers are dropped, and a tree is left."""
+    mesh, rng = hand(), np.random.default_rng(0)
+    poses = np.stack([bend_fingers(mesh, rng.uniform(0, 1.2, 4)) for _ in range(12)])
+    middle = mesh.corners.mean(axis=1)
+    finger = np.abs(middle[:, :1] - KNUCKLES[:, 0]).argmin(axis=1)
+    label = np.where(middle[:, 2] < KNUCKLES[0, 2], 0, 1 + finger)
+    search = PartSearch(PosedSurface(mesh, poses), SkeletonConfig())
+    links = search.contacts(label)
+    assert len(links) == 7                                          # the palm to four fingers, three between them
+    assert sorted(map(tuple, spanning_links(search, label, links).tolist())) == [(0, 1), (0, 2), (0, 3), (0, 4)]
 
 
 def test_fingers_whose_roots_touch_hang_on_the_palm():

@@ -2,7 +2,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, replace
 from typing import Any, Literal
@@ -11,6 +11,7 @@ import numpy as np
 
 from scanprep.batch.room import Step, run_uncached, substeps
 from scanprep.geometry.mesh import Mesh, take_any_mesh
+from scanprep.geometry.upright import find_up
 from scanprep.judgement import Judgement, WrongScaleError
 from scanprep.registration.person import has_limbs
 from scanprep.skeleton.joints import joint_gaps
@@ -18,7 +19,7 @@ from scanprep.skeleton.tree import Skeleton
 from scanprep.words import describe_result
 
 from ..body import BodyModel, Progress
-from ..digests import body_digests
+from ..digests import body_digests, check_bodies
 from ..files import BUILT_IN, load_model
 from ..fitting.search import ModelMismatchError
 from .config import LearnConfig
@@ -91,7 +92,8 @@ def be_quiet(stage: str) -> AbstractContextManager[Progress]:
 def learn_body(template: Mesh, poses: np.ndarray, shapes: np.ndarray | None = None, skeleton: Skeleton | None = None,
                kind: Kind = "scape", config: LearnConfig | SkinConfig | None = None, prior: str = "auto", *,
                own_skeleton: Skeleton | None = None, sexes: Sequence[str] = (), people: Sequence[str] = (),
-               stage: Stage = be_quiet, step: Step = run_uncached) -> LearnedBody:
+               landmarks: Mapping[str, int] | None = None, stage: Stage = be_quiet, step: Step = run_uncached
+               ) -> LearnedBody:
     """Learn a body model as `scape learn` does, to the same bytes.
 
     A known model stands in where poses or people are few, the number of parts is chosen by left-out poses, and large
@@ -120,6 +122,8 @@ def learn_body(template: Mesh, poses: np.ndarray, shapes: np.ndarray | None = No
         "female", "male" or "" of every shape, for a model of each sex too.
     people : sequence of str, optional
         For the kind "mixed": whose body each of the poses is.
+    landmarks : dict of str to int, optional
+        Vertices of the template that the model keeps, for `complete`.
     stage : callable, optional
         Gives for a stage's name a context manager of the callback that is called with (done, total), as
         `scanprep.console.bar`.
@@ -147,6 +151,8 @@ def learn_body(template: Mesh, poses: np.ndarray, shapes: np.ndarray | None = No
 
     [SCAPE] §3
     """
+    poses = check_bodies(template, poses, "poses")
+    template = find_up(template, poses)
     config = config or (MIX if kind == "mixed" else SkinConfig() if kind == "skinning" else LearnConfig())
     # large meshes are learned on fewer vertices; the given bodies are only needed for their digests then
     digests, sizes = body_digests(poses, shapes), Resolutions(template)
@@ -176,7 +182,8 @@ def learn_body(template: Mesh, poses: np.ndarray, shapes: np.ndarray | None = No
     with stage("finishing at full resolution") as progress:
         models = sizes.finish(models, digests, progress)
     gaps = [round(float(gap), 3) for gap in joint_gaps(body, poses, tree)]
-    return LearnedBody(models, choice, len(body.vertices), shapes).with_info(joint_gaps=gaps)
+    learned = LearnedBody(models, choice, len(body.vertices), shapes)
+    return learned.with_info(joint_gaps=gaps, landmarks=dict(landmarks or {}))
 
 
 def _learn_kind(kind: Kind, bodies: tuple[Mesh, np.ndarray, np.ndarray | None, Skeleton], config: Any,

@@ -19,7 +19,6 @@ from scanprep.geometry.landmarks import read_landmark_vertices
 from scanprep.geometry.members import check_members, find_spikes
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.tables import read_table
-from scanprep.geometry.upright import find_up
 from scanprep.judgement import carry_judgements
 from scanprep.skeleton.names import note_numbered_parts
 from scanprep.skeleton.roles import joint_in_words
@@ -89,7 +88,7 @@ def learn(poses: Path, output: Output, shapes: Path | None = None, template: Pat
     # bodies to learn from, and the landmarks that the model keeps
     (body, posed, names), who = (_read_mix(poses) if kind == "mixed" else
                                  (read_poses(poses, template, subject, unit), []))
-    body = find_up(body if up is None else replace(body, up="xyz".index(up)), posed)
+    body = body if up is None else replace(body, up="xyz".index(up))
     people, spikes = None, find_spikes(body, posed, str(poses), names)
     if shapes is not None:
         people, names = _read_people(shapes, body, unit)
@@ -103,8 +102,8 @@ def learn(poses: Path, output: Output, shapes: Path | None = None, template: Pat
     step = KeptSteps(space)
     learned = learn_body(body, posed, people, _read_skeleton(skeleton, body), kind,
                          mixed if kind == "mixed" else skinning if kind == "skinning" else scape, prior,
-                         own_skeleton=own, sexes=sexes or (), people=who, stage=bar, step=step
-                         ).with_info(landmarks=named, spikes=spikes)
+                         own_skeleton=own, sexes=sexes or (), people=who, landmarks=named, stage=bar, step=step
+                         ).with_info(spikes=spikes)
     tree = learned.model.skeleton
     if learned.choice is not None:
         note_numbered_parts(tree)

@@ -313,6 +313,8 @@ def joint_gaps(template: Mesh, poses: np.ndarray, skeleton: Skeleton) -> np.ndar
     corners = template.edges[template.edge_use == 2]
     for a, b in enumerate(skeleton.parents[1:], start=1):
         border = (np.sort(both, axis=1) == [min(a, b), max(a, b)]).all(axis=1)
+        if not border.any():                                 # a tree made by hand may link parts that do not touch
+            border = (both == a).any(axis=1) & (both[:, 0] != both[:, 1])
         ring = surface.x[corners[border]].mean(axis=1)
         radius = np.linalg.norm(ring - ring.mean(axis=0), axis=1).mean()
         place = skeleton.joints[a] - surface.origin
