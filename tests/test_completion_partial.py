@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from completion_bodies import half_view, worm_with_prior
@@ -142,6 +144,22 @@ def test_an_empty_scan_is_refused(model, known):
         complete(model.subject(None), Mesh(np.zeros((0, 3)), np.zeros((0, 3))), known[3])
 
 
+def test_a_body_as_small_as_a_hand_is_completed_as_well_as_a_large_one(model):
+    """Distances of matches and limits are those of a person, so a worm of 15 cm is searched at that size."""
+    small = replace(model, template=model.template.with_vertices(model.template.vertices / 20),
+                    skeleton=replace(model.skeleton, joints=model.skeleton.joints / 20))
+    body, subject = small.template.with_vertices(small.vertices(POSE, None, TRANS)), small.subject(None)
+    points, seen = half_view(body, np.array([0.3, -1, 0.5]))
+    result = complete(subject, points, None, QUICK)
+    at_seen, at_unseen = errors(body, result, seen)
+    assert 20 * at_seen < 0.002 and 20 * at_unseen < 0.012
+    assert at_unseen < result.expected_error[~seen].mean() < 0.012 / 20
+    # a fit that goes on starts where the first one ended
+    again = complete(subject, points, None, QUICK, start=result)
+    np.testing.assert_allclose(again.trans, result.trans, atol=2e-4)
+    assert again.scale == pytest.approx(1) and errors(body, again, seen)[1] < 1.1 * at_unseen
+
+
 def test_limbs_are_drawn_from_the_prior_given_the_rest(model):
     body = FixedBody(model.subject(None))
     covariance = np.zeros((12, 12))
@@ -163,8 +181,8 @@ def test_limbs_are_drawn_from_the_prior_given_the_rest(model):
 
 def test_a_part_inside_another_is_pushed_out(model):
     subject, part = model.subject(None), model.skeleton.part_of_vertex(model.template)
-    contact = Contact(model.skeleton, part)
     rest = model.template.with_vertices(subject.vertices(np.zeros((4, 3))))
+    contact = Contact(model.skeleton, part, rest.vertices, rest.vertex_normals)
     assert contact.violation(rest.vertices, rest.vertex_normals)[0].max() == 0
     moved = rest.vertices.copy()
     moved[part == 3] += rest.vertices[part == 0].mean(axis=0) - rest.vertices[part == 3].mean(axis=0)
@@ -173,6 +191,9 @@ def test_a_part_inside_another_is_pushed_out(model):
     inside = (part == 3) & (depth > 0)
     assert inside.sum() > 0.5 * (part == 3).sum() and not depth[(part == 1) | (part == 2)].any()
     np.testing.assert_allclose(target, mesh.vertices + depth[:, None] * normal)
+    # what is inside at rest, as bones of a finger with a short one between, says nothing
+    folded = Contact(model.skeleton, part, mesh.vertices, mesh.vertex_normals)
+    assert not folded.violation(mesh.vertices, mesh.vertex_normals).excess.any()
 
 
 def test_robust_weight_is_one_at_zero_and_a_quarter_at_its_scale():

@@ -19,7 +19,7 @@ from model.fitting.not_skin import CLOSE, NotSkin, find_not_skin
 from model.fitting.rounds import solve_jointly
 from model.fitting.scale import ScaledBody, check_size
 from model.fitting.scan import Scan, ScanPoints, all_points
-from model.fitting.scan_fit import STRANGE, ScanFit, scan_fit
+from model.fitting.scan_fit import STRANGE, ScanFit, resize_to_person, scan_fit
 from model.fitting.starts import best_starts, first_starts, going_on
 from model.linear import Subject
 from model.people import person_judgement
@@ -312,14 +312,17 @@ def _complete(body: BodyModel | Subject, scan: Scan, landmarks: tuple[np.ndarray
     total, person = config.rounds + 3, as_body(body)
     solve = solve_jointly if config.method == "joint" else turns_of(body, config)
     inputs = prepare_in_metres(person, scan, landmarks, masked, config)
-    sized = ScaledBody(person) if config.free_scale else person
-    fit = scan_fit(sized, inputs.cloud, inputs.vertices, inputs.points, config)
-    # initialise: many starts with few points, the best ones with each limb tried in other poses
+    # lengths of the search are those of a person; pictures and the alternation keep their own
+    sized, enlarged = (person, 1.0) if inputs.cloud.person or config.method != "joint" else resize_to_person(person)
+    inputs = inputs.scale_by(enlarged)
+    free = ScaledBody(sized) if config.free_scale else sized
+    fit = scan_fit(free, inputs.cloud, inputs.vertices, inputs.points, config)
+    # initialise: many starts with few points, the best ones with each limb tried in other poses [SCAPE] §7
     sparse = fit.few()
-    starts = going_on(fit, start.pose, start.trans, start.betas) if start else first_starts(fit, sparse)   # [SCAPE] §7
+    starts = going_on(fit, enlarged, start.pose, start.trans, start.betas) if start else first_starts(fit, sparse)
     report_progress(1, total)
     starts = best_starts(sparse, starts)
-    if not config.free_scale:
+    if fit.body is person:
         check_size(person, sparse, starts[0])
     x, rival = with_standing(fit, sparse, *with_limbs(fit, sparse, starts))
     report_progress(2, total)
@@ -331,23 +334,28 @@ def _complete(body: BodyModel | Subject, scan: Scan, landmarks: tuple[np.ndarray
     # let the surface follow the scan where it has data, and lift the soles onto the floor
     predicted = person.template.with_vertices(person.vertices(x))
     cloud = fit.without_ignored(inputs.cloud, predicted)
-    completed, seen, used, rms = free_surface(predicted, cloud, config.surface_weight)   # [SCAPE] Eq. 10, over Y
+    completed, seen, used, rms = free_surface(predicted.with_vertices(enlarged * predicted.vertices),
+                                              cloud.scale_by(enlarged), config.surface_weight)  # [SCAPE] Eq. 10, over Y
+    completed, rms = completed.with_vertices(completed.vertices / enlarged), rms / enlarged
     foot = foot_of_vertex(predicted, person.skeleton)
     standing = put_on_floor(predicted, completed, foot, cloud.points, cloud.normals)
     completed = completed if standing is None else completed.with_vertices(standing.vertices)
     # a depth picture shows clothes, and its noise is larger than the model's error
     if cloud.person is not None:
         completed, rms = predicted, distance_to(predicted, cloud.some(used))
-    # the expected error of every vertex, and the residuals of the landmarks
+    # the expected error of every vertex, by lengths of a person, and the residuals of the landmarks
     bare = seen if cloud.masked is None else seen & ~near_clothes(predicted, cloud.masked.points)
-    error = estimate_error(open_error, distance_to_seen(predicted, bare), rms, person.left_out_error)
+    left_out = None if person.left_out_error is None else enlarged * person.left_out_error
+    error = estimate_error(enlarged * open_error, enlarged * distance_to_seen(predicted, bare), enlarged * rms,
+                           left_out) / enlarged
     report_progress(total, total)
     pose, trans, betas = person.split(x)
     shape = body.betas if isinstance(body, Subject) else betas if person.n_betas else None
     distances = np.linalg.norm(predicted.vertices[inputs.vertices] - inputs.points, axis=1)
     landmark_rms = float(np.sqrt((distances**2).mean())) if len(distances) else np.nan
     result = Completion(completed, predicted, pose, shape, trans, seen, rms, cloud.share_of_area(used), landmark_rms,
-                        solved.converged, solved.rounds, solved.energies, inputs.metres, error,
+                        solved.converged, solved.rounds, solved.energies,
+                        inputs.metres if config.free_scale else 1.0, error,
                         probability_within(error, config.tolerance), soles=standing.beyond if standing else None)
     # judge the result: reasons why it means nothing, then reasons to look at it
     problems = [completion_problem(result, inputs.cloud.points, config.free_scale),
@@ -391,12 +399,12 @@ def completion_doubts(fit: ScanFit, x: np.ndarray, error: np.ndarray, seen: np.n
     border of a picture are a guess and give no reason.
     """
     names, doubts, shown = fit.body.skeleton.names, [], ~fit.beyond(x)
-    areas = fit.body.template.vertex_areas
+    areas, metres = fit.body.template.vertex_areas, fit.body.in_metres(x)[1]
     # parts with a large expected error, the worst first; less than half within the picture counts as outside
     open_parts = [(float(np.sqrt((error[of_part]**2).mean())), p) for p in range(len(names))
                   if (of_part := fit.part == p).any() and shown[of_part].mean() >= 0.5]
     for off, p in sorted(open_parts, reverse=True):
-        if off > GUESSED:
+        if off > GUESSED * metres:
             share = areas[seen & (fit.part == p)].sum() / areas[fit.part == p].sum()
             much = f"{100 * share:.0f}% of it was seen" if share else "nothing of it was seen"
             doubts.append(f"the {in_words(names[p])} may be {1000 * off:.0f} mm off, {much}")
@@ -405,7 +413,7 @@ def completion_doubts(fit: ScanFit, x: np.ndarray, error: np.ndarray, seen: np.n
     doubts += [f"the {joint_in_words(names[j])} is {np.degrees(strange[j]):.0f} degrees from any way that it is known "
                "to be held" for j in np.argsort(-strange) if strange[j] > STRANGE]
     # a model that is inexact on poses it was not learned from
-    if (left_out := fit.body.left_out_error) is not None and left_out > CRUDE * size(fit.body.template):
+    if (left_out := fit.body.left_out_error) is not None and left_out > CRUDE * metres * size(fit.body.template):
         doubts.append(f"the model was {1000 * left_out:.0f} mm off in poses that it was not learned from: "
                       "it needs more")
     return doubts + find_stray(fit, x)
@@ -441,8 +449,9 @@ def ambiguous(fit: ScanFit, x: np.ndarray, rival: np.ndarray | None) -> list[str
         return []
     # mean distance of the two bodies, without what lies outside the picture
     apart = np.linalg.norm(fit.mesh(x).vertices - fit.mesh(rival).vertices, axis=1)[~fit.beyond(x)].mean()
-    return [f"another body, {1000 * apart:.0f} mm away in the mean, explains the scan nearly as well"] \
-        if apart > DOUBTFUL else []
+    off = 1000 * fit.body.in_metres(x)[1] * apart
+    words = f"another body, {off:.0f} mm away in the mean, explains the scan nearly as well"
+    return [words] if apart > DOUBTFUL else []
 
 
 def find_stray(fit: ScanFit, x: np.ndarray) -> list[str]:

@@ -88,7 +88,8 @@ class ScaledBody(FixedBody):
         factor = float(np.exp(LOOSE * x[-1]))
         out, place = x[:-1].copy(), slice(self.n_angles, self.n_angles + 3)
         out[place] = factor * (self.subject.origin + x[place]) - self.subject.origin
-        return out, factor
+        own, smaller = self.inner.in_metres(out)
+        return own, smaller * factor
 
 
 @dataclass(frozen=True, eq=False)

@@ -88,8 +88,10 @@ def sample_body(body: FixedBody, ids: np.ndarray | None, count: int, ignored_par
     chosen = spread_points(template.vertices[all_or_some], count)
     ignored = part_vertices(template, skeleton, ignored_parts)[all_or_some]
     part = skeleton.part_of_vertex(template)[all_or_some]
+    at_rest = all_or_some[chosen]
+    contact = Contact(skeleton, part[chosen], template.vertices[at_rest], template.vertex_normals[at_rest])
     return BodySample(body if ids is None else body.some(ids), all_or_some, chosen, chosen[~ignored[chosen]], ignored,
-                      part, Contact(skeleton, part[chosen]), gaps)
+                      part, contact, gaps)
 
 
 @dataclass(frozen=True, eq=False)
@@ -363,6 +365,14 @@ def scan_fit(body: FixedBody, cloud: ScanPoints, vertices: np.ndarray, points: n
                    config.scan_points, config, np.random.default_rng(config.seed))
 
 
+def resize_to_person(body: FixedBody) -> tuple[FixedBody, float]:
+    """Scale a hand or a horse to the size of a person, which the lengths of the search suit; also return the factor."""
+    size = float(np.sqrt(body.template.face_areas.sum()))
+    person = 1.36  # metres: root of the surface area of a person; bodies from half to twice that size are not scaled
+    factor = 1.0 if 0.5 < size / person < 2 else person / size
+    return body if factor == 1 else ResizedBody(body, factor), factor
+
+
 def prepare_scan_fit(body: FixedBody, scan: Mesh | np.ndarray, vertices: np.ndarray, points: np.ndarray,
                      config: ScanFitConfig, masked: np.ndarray | None = None) -> tuple[ScanFit, float]:
     """Prepare the fit of a body of any size to a scan; also return the factor by which both were scaled.
@@ -370,10 +380,7 @@ def prepare_scan_fit(body: FixedBody, scan: Mesh | np.ndarray, vertices: np.ndar
     The lengths of the search suit a person, so a hand or a horse is scaled to that size. `vertices` (L,) int and
     `points` (L, 3), metres, are landmarks, none or more; `masked` (n,) bool points of hair and clothes.
     """
-    size = float(np.sqrt(body.template.face_areas.sum()))
-    person = 1.36  # metres: root of the surface area of a person; bodies from half to twice that size are not scaled
-    factor = 1.0 if 0.5 < size / person < 2 else person / size
-    sized = body if factor == 1 else ResizedBody(body, factor)
+    sized, factor = resize_to_person(body)
     return scan_fit(sized, prepare_scan(scan, masked=masked, metres=factor), vertices, factor * points, config), factor
 
 

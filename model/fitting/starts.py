@@ -41,9 +41,13 @@ def first_starts(fit: ScanFit, few: ScanFit) -> np.ndarray:
     return np.concatenate([more, marked])
 
 
-def going_on(fit: ScanFit, pose: np.ndarray, trans: np.ndarray, betas: np.ndarray | None) -> np.ndarray:
-    """Start from an earlier fit of the scan: unknowns (1, P) of pose (J, 3), trans (3,), and betas where known."""
-    x = fit.body.join(pose[None], trans[None])
+def going_on(fit: ScanFit, factor: float, pose: np.ndarray, trans: np.ndarray, betas: np.ndarray | None) -> np.ndarray:
+    """Start from an earlier fit of the scan: unknowns (1, P) of pose (J, 3), trans (3,), and betas where known.
+
+    The pose and place are those of the body at its own size; the fit has it larger by a factor.
+    """
+    origin = fit.body.subject.origin
+    x = fit.body.join(pose[None], (factor * (origin + trans) - origin if factor != 1 else trans)[None])
     if fit.body.n_betas and betas is not None:
         x[:, fit.body.n_angles + 3:] = betas
     return x
