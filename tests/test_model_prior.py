@@ -190,7 +190,7 @@ def test_a_model_of_something_else_is_refused_by_name_and_left_out_by_itself(kno
         raise ModelMismatchError("the model does not come to lie on the template")
 
     monkeypatch.setattr("model.learning.prior.lay_model", does_not_lie)
-    monkeypatch.setattr("model.learning.cli.has_limbs", lambda template: True)
+    monkeypatch.setattr("model.learning.body.has_limbs", lambda template: True)
     poses = random_poses(known, 12, np.random.default_rng(0), 0.4)
     for i, body in enumerate(known.subject().vertices(poses)):
         write_mesh(tmp_path / "poses" / f"{i:02d}.ply", known.template.with_vertices(body))
@@ -203,7 +203,7 @@ def test_a_model_of_something_else_is_refused_by_name_and_left_out_by_itself(kno
     assert "learned without the built-in people" in capsys.readouterr().err
     assert "prior" not in load_model(tmp_path / "m.npz").info
     # of many poses and people nobody asks
-    monkeypatch.setattr("model.learning.cli.ENOUGH", 12)
+    monkeypatch.setattr("model.learning.body.ENOUGH", 12)
     assert main([*words, "--shapes", str(tmp_path / "poses")]) == 0
     assert "without the built-in people" not in capsys.readouterr().err
 

@@ -137,8 +137,10 @@ def learn_body(template: Mesh, poses: np.ndarray, shapes: np.ndarray | None = No
 
     Raises
     ------
+    ModelMismatchError
+        A prior that does not fit.
     ValueError
-        As `learn_scape` and `choose_skeleton`; a prior that does not fit.
+        As `learn_scape` and `choose_skeleton`.
 
     Examples
     --------
@@ -216,4 +218,4 @@ def _bring_prior(body: Mesh, prior: str, stage: Stage, step: Step) -> TemplatePr
         if prior == "auto":
             warnings.warn(f"learned without the built-in people: {error}", stacklevel=2)
             return None
-        raise ValueError(f"prior {prior}: {error}") from error
+        raise ModelMismatchError(f"prior {prior}: {error}") from error

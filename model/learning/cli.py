@@ -26,6 +26,7 @@ from scanprep.skeleton.tree import Skeleton
 
 from ..body import BodyModel, Up
 from ..cli import about, read_bodies
+from ..fitting.search import ModelMismatchError
 from .body import Kind, learn_body
 from .config import LearnConfig
 from .mixing import MIX
@@ -100,10 +101,13 @@ def learn(poses: Path, output: Output, shapes: Path | None = None, template: Pat
     if kind == "mixed" and skeleton is None and own is None:
         raise ValueError(f"{poses}: a mix of people shows no skeleton; name one with --skeleton")
     step = KeptSteps(space)
-    learned = learn_body(body, posed, people, _read_skeleton(skeleton, body), kind,
-                         mixed if kind == "mixed" else skinning if kind == "skinning" else scape, prior,
-                         own_skeleton=own, sexes=sexes or (), people=who, landmarks=named, stage=bar, step=step
-                         ).with_info(spikes=spikes)
+    config = mixed if kind == "mixed" else skinning if kind == "skinning" else scape
+    try:
+        learned = learn_body(body, posed, people, _read_skeleton(skeleton, body), kind, config, prior, own_skeleton=own,
+                             sexes=sexes or (), people=who, landmarks=named, stage=bar, step=step)
+    except ModelMismatchError as error:
+        raise ValueError(f"--{error}") from error
+    learned = learned.with_info(spikes=spikes)
     tree = learned.model.skeleton
     if learned.choice is not None:
         note_numbered_parts(tree)
