@@ -17,6 +17,7 @@ from scanprep.depth_camera.person import PicturedPerson
 from scanprep.geometry.surface import OrientedPoints
 from scanprep.skeleton.tree import Skeleton
 
+from ..human_poses import is_person
 from .normals import faces, facing_point
 from .scan import ScanPoints
 
@@ -147,15 +148,23 @@ def find_camera(cloud: ScanPoints, viewpoint: np.ndarray | None = None) -> Camer
 
 
 class Contact:
-    """Self-contact of vertices, given the part (n,) of each: no part may enter another that is not its neighbour."""
+    """Self-contact of vertices, given the part (n,) of each: no part may enter another that is not its neighbour.
 
-    def __init__(self, skeleton: Skeleton, part: np.ndarray) -> None:
+    `places` and `normals` (n, 3) are those at rest. Vertices that seem to be inside another part even there say
+    nothing, as bones of a finger with a short one between. On a person those are the insides of thighs, which do press
+    on each other.
+    """
+
+    def __init__(self, skeleton: Skeleton, part: np.ndarray, places: np.ndarray, normals: np.ndarray) -> None:
         apart = ~np.eye(len(skeleton.parents), dtype=bool)
         child = np.arange(1, len(skeleton.parents))
         apart[child, skeleton.parents[child]] = apart[skeleton.parents[child], child] = False
         self._order = np.argsort(part, kind="stable")
         used, self._starts = np.unique(part[self._order], return_index=True)
         self._mine, self._apart = np.split(self._order, self._starts[1:]), apart[np.ix_(used, used)]
+        self._silent = np.zeros(len(part), dtype=bool)
+        if not is_person(skeleton):
+            self._silent = self.violation(places, normals).excess > 0
 
     def violation(self, places: np.ndarray, normals: np.ndarray) -> Violation:
         """Compute how deep vertices (n, 3) with normals (n, 3) are inside another part."""
@@ -170,7 +179,7 @@ class Contact:
             if not len(others):
                 continue
             far, hit = cKDTree(places[others]).query(places[own], distance_upper_bound=INSIDE)
-            close = np.isfinite(far)
+            close = np.isfinite(far) & ~self._silent[own]
             own, hit = own[close], others[hit[close]]
             # depth behind the tangent plane of the nearest vertex of the other parts
             inside = np.einsum("nd,nd->n", normals[hit], places[hit] - places[own]) - PRESSED

@@ -88,8 +88,10 @@ def sample_body(body: FixedBody, ids: np.ndarray | None, count: int, ignored_par
     chosen = spread_points(template.vertices[all_or_some], count)
     ignored = part_vertices(template, skeleton, ignored_parts)[all_or_some]
     part = skeleton.part_of_vertex(template)[all_or_some]
+    at_rest = all_or_some[chosen]
+    contact = Contact(skeleton, part[chosen], template.vertices[at_rest], template.vertex_normals[at_rest])
     return BodySample(body if ids is None else body.some(ids), all_or_some, chosen, chosen[~ignored[chosen]], ignored,
-                      part, Contact(skeleton, part[chosen]), gaps)
+                      part, contact, gaps)
 
 
 @dataclass(frozen=True, eq=False)
