@@ -9,6 +9,7 @@ from scanprep.geometry import rotations
 from scanprep.geometry.mesh import Mesh
 from scanprep.skeleton.find import search_skeleton
 from scanprep.skeleton.joints import dissolve_bands, passages, to_tree, without_weak
+from scanprep.skeleton.labels import label_patches
 from scanprep.skeleton.motions import PosedSurface, closure, fit_motions, rigid_costs
 from scanprep.skeleton.names import part_partners
 from scanprep.skeleton.parts import PartSearch, SkeletonConfig
@@ -115,6 +116,28 @@ def test_tied_labels_are_mirror_images(animal, poses):
     assert len(np.unique(joined)) == len(partner) - 1
     pairs = np.array([[0, 1], *np.sort(partner[[[0, 1]]])])
     assert mirror_pairs(pairs, partner).tolist() == [1, 0]
+
+
+def test_tied_labels_stay_connected_where_triangles_are_not_paired_one_to_one():
+    """A triangle of the right side whose partner lies in another part takes the part that surrounds it."""
+    x, y = (g.ravel() for g in np.meshgrid(np.arange(7), np.arange(7), indexing="ij"))
+    corner = np.flatnonzero((x < 6) & (y < 6))
+    side = np.stack([corner, corner + 7, corner + 8, corner, corner + 8, corner + 1], 1).reshape(-1, 3)
+    number = np.where(x == 0, np.arange(49), np.arange(49) + 42)             # of the mirrored vertices
+    sheet = Mesh(np.concatenate([np.stack([x, y, 0 * x], 1), np.stack([-x, y, 0 * x], 1)[x > 0]]).astype(float),
+                 np.concatenate([side, number[side][:, ::-1]]))
+    F, at = len(side), np.abs(sheet.corners.mean(axis=1))
+    near = (at[:, 0] < 3).astype(np.int64)                                    # 1 at the plane of symmetry, else 0
+    label = np.where(np.arange(2 * F) < F, 0, 2) + near
+    pairing = (np.arange(2 * F) + F) % (2 * F)
+    stray = F + int(np.linalg.norm(at[:F, :2] - [1.5, 3], axis=1).argmin())   # amid the near part of the right side
+    pairing[stray] = int(np.linalg.norm(at[:F, :2] - [5, 3], axis=1).argmin())
+    symmetry = Symmetry(np.array([1.0, 0, 0]), np.zeros(3), pairing, np.arange(2 * F) < F, 0.0, 1.0,
+                        sheet.vertices * [-1, 1, 1])
+    surface = PosedSurface(sheet, np.stack(2 * [sheet.vertices]))
+    costs = (label[:, None] != np.arange(4)).astype(float)
+    moved = Sides(surface, symmetry).relabel(costs, 1e-3, label, np.array([2, 3, 0, 1]))
+    assert moved[stray] == 3 and label_patches(surface.pairs, moved).max() + 1 == 4
 
 
 def test_borders_of_one_side_stand_for_those_of_both():

@@ -162,7 +162,8 @@ class PartsSearch:
             # the pose prior of people needs the names of parts, which a finer skeleton may lose
             if finer is None or (is_person(best) and not is_person(finer[0])):
                 continue
-            errors.setdefault(len(finer[0].parents), finer[1])
+            count = len(finer[0].parents)
+            errors[count] = min(errors.get(count, np.inf), finer[1])
             if finer[1] <= (1 - GAIN * max(1, wanted / USUAL)) * least:
                 (best, least), vain = finer, 0
         return ChosenSkeleton(best, errors, finder.runs[0].search.sides.tied, np.nan)

@@ -19,7 +19,7 @@ from .sides import mirror_pairs, reductions
 from .tree import Skeleton
 
 # Joints whose parts carry them apart by more than this times the radius of their border are doubtful. Shoulders of
-# people whose collar bones are in the chest have 0.9, other joints of people at most 0.3.
+# people whose collar bones are in the chest have 0.9, the 20 parts of 71 SCAPE poses at most 0.64.
 LOOSE = 1.0
 LOOP_SEPARATION = 1.5            # in a loop, parts less than this times the separation apart are merged
 
