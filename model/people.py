@@ -4,8 +4,9 @@ from __future__ import annotations
 import numpy as np
 
 from scanprep.geometry.mesh import Mesh
-from scanprep.judgement import Judgement, implausible_body
+from scanprep.judgement import Judgement
 from scanprep.pictures.camera import tallest
+from scanprep.plausible import implausible_body
 from scanprep.skeleton.roles import find_roles
 
 from .body import BodyModel

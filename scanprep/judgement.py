@@ -13,27 +13,7 @@ from .geometry.mesh import Mesh
 Verdict = Literal["good", "check", "failed"]
 
 HAND = 0.06                 # share of a body's size (root of its surface area): the width of a hand, 8 cm on a man
-
-# ANSUR II, 6,068 soldiers: 1.41 to 1.99 m, 36 to 144 kg, 15 to 43 kg/m²; a litre of a person weighs about a kilogram.
-# The population varies more than soldiers: bodies beyond 1.40 to 2.10 m or 35 to 200 litres need a look.
-ADULTS, VOLUMES = (1.40, 2.10), (35.0, 200.0)          # metres, litres
-# litres per square metre of stature: beyond the first range a look is needed, beyond the second nobody is so built;
-# 400 synthetic people have 14 to 31, a body completed from the scan of a chair 8.6
-BUILD, ANY_BUILD = (13.0, 55.0), (9.0, 90.0)
-# The squared length of K betas is chi-square distributed. ONE_OF: one person in this number is beyond the first limit,
-# which is 7.0 for 18 betas. USUAL: the limit is at least this times the root of K. Completions of people reach 1.4
-# times that root, those of a chair and a cylinder, which other limits refuse, 2.1 and 2.3. TOO_LONG: the second limit
-# is this times the first. `mosh` with a model of other people finds up to 12 for 18 betas where the motion is right
-# but the body is not; recordings scaled by 1.6 and 2.54 end at 20 and 46.
-ONE_OF, USUAL, TOO_LONG = 10_000, 1.6, 1.8
-# Metres: a toddler of one year, and taller than almost anybody. Children below an adult's size need a look.
-ANYBODY = (0.65, 2.30)
-WRONG_UNIT = "the wrong unit or scale? (--unit, or --unit unknown)"
 NAMED = 3                   # results that a judgement about many names: more would not be read
-
-
-class WrongScaleError(ValueError):
-    """A scan shows a person of a size that nobody has: its unit is another one."""
 
 
 @dataclass(frozen=True)
@@ -155,71 +135,6 @@ def carry_judgements(inputs: Iterable[Path], used: Iterable[Path] = ()) -> Judge
     return Judgement.of(problems, doubts)
 
 
-def implausible_body(stature: float, volume: float | None = None, betas: np.ndarray | None = None, cause: str = ""
-                     ) -> Judgement:
-    """Judge whether a person can have such a body, with the likely cause where not.
-
-    Parameters
-    ----------
-    stature : float, metres
-        Height of the body.
-    volume : float, litres, optional
-        Volume of the body.
-    betas : (K,) float, standard deviations, optional
-        Shape coefficients.
-    cause : str
-        Why the body may be implausible, where that is known; by default the causes for scans and recordings.
-
-    Returns
-    -------
-    Judgement
-
-    Examples
-    --------
-    >>> implausible_body(1.75, 74.0, np.ones(10)).verdict
-    'good'
-    >>> implausible_body(2.61, 290.0).reasons[0]
-    'the person is 2.61 m tall: the wrong unit or scale? (--unit, or --unit unknown)'
-    """
-    failed, check = [], []
-    if not ANYBODY[0] <= stature <= ANYBODY[1]:
-        failed.append(f"the person is {stature:.2f} m tall: {cause or WRONG_UNIT}")
-    elif not ADULTS[0] <= stature <= ADULTS[1]:
-        who = "a child" if stature < ADULTS[0] else "a giant"
-        check.append(f"the person is {stature:.2f} m tall: {cause or f'{who}, or {WRONG_UNIT}'}")
-    if volume is not None and not failed:
-        # build: volume relative to stature, as the body-mass index
-        build = volume / stature**2
-        little = "flattened, or something else than a person?"
-        words = f"the person has {volume:.0f} litres at {stature:.2f} m"
-        if not ANY_BUILD[0] <= build <= ANY_BUILD[1]:
-            what = "something else than a person, or several?" if build > BUILD[0] else little
-            failed.append(f"{words}, as nobody has: {cause or what}")
-        elif not BUILD[0] <= build <= BUILD[1] or (stature >= ADULTS[0] and not VOLUMES[0] <= volume <= VOLUMES[1]):
-            much = "clothes, a second person, or the wrong scale?"
-            check.append(f"{words}: {cause or (much if build > BUILD[0] else little)}")
-    if betas is not None and len(betas):
-        # length of the betas: their root mean square is 1 in the population
-        length, usual = float(np.linalg.norm(betas)), float(np.sqrt(len(betas)))
-        most = longest_betas(len(betas))
-        words = f"the shape is {length:.0f} standard deviations from the mean, {usual:.0f} are usual"
-        if length > TOO_LONG * most:
-            failed.append(f"{words}: {cause or 'something else than a person, or the wrong scale?'}")
-        elif length > most:
-            check.append(f"{words}: {cause or 'a body that the model does not know, or markers that stand off?'}")
-    return Judgement.of(failed, check)
-
-
-def longest_betas(count: int) -> float:
-    """Compute the largest plausible length of betas, standard deviations: at most one person in `ONE_OF` is beyond.
-
-    [MoSh] Eq. 20
-    """
-    from scipy.special import gammainccinv
-
-    return float(np.sqrt(max(2 * gammainccinv(count / 2, 1 / ONE_OF), USUAL**2 * count)))
-
-
 def size(body: Mesh) -> float:
     """Compute the size of a body: the square root of its surface area, metres."""
     return float(np.sqrt(body.face_areas.sum()))
@@ -229,26 +144,3 @@ def extent(points: np.ndarray) -> float:
     """Compute the diagonal of the box around points (n, 3), in their unit; NaN without finite points."""
     finite = points[np.isfinite(points).all(axis=-1)]
     return float(np.linalg.norm(np.ptp(finite, axis=0))) if len(finite) else np.nan
-
-
-def check_unit(scan: Mesh | np.ndarray, body: np.ndarray, what: str) -> None:
-    """Raise WrongScaleError for a scan that cannot show a body (N, 3), metres, before minutes of work on it.
-
-    A hand has a tenth of a body's size, and a room around it five times that size. `what` is the subject of the
-    sentence.
-    """
-    points = scan.vertices if isinstance(scan, Mesh) else scan
-    if problem := unit_problem(extent(points), extent(body), what, 1 / 30, 10):
-        raise WrongScaleError(problem)
-
-
-def unit_problem(found: float, expected: float, what: str, least: float = 0.2, most: float = 2.5) -> str | None:
-    """Return why data `found` metres large, for a body of `expected` metres, are in another unit; None if they are not.
-
-    `what` is the subject of the sentence; `least` and `most` are the smallest and the largest share of a body's extent
-    that the data may have.
-    """
-    if not np.isfinite(found) or least <= found / expected <= most:
-        return None
-    return (f"{what} {found:.3g} m from corner to corner, {found / expected:.3g} times as large as the body: the wrong "
-            "unit? (--unit)")

@@ -43,19 +43,9 @@ from scanprep.cli import Output
 from scanprep.console import Metric, Outcome
 from scanprep.correspondence.correspondences import Correspondences, correspondences_doubts, correspondences_problem
 from scanprep.geometry.files import PointCloud, write_points
-from scanprep.judgement import (
-    ONE_OF,
-    USUAL,
-    Judgement,
-    WrongScaleError,
-    carry_judgements,
-    implausible_body,
-    judge_many,
-    longest_betas,
-    read_judgement,
-    size,
-)
+from scanprep.judgement import Judgement, carry_judgements, judge_many, read_judgement, size
 from scanprep.pipeline.prepare import PrepareConfig
+from scanprep.plausible import ONE_OF, USUAL, WrongScaleError, implausible_body, longest_betas
 from scanprep.registration.nonrigid import Registration, registration_problem
 from scanprep.registration.schedule import RegistrationConfig
 from scanprep.skeleton.find import skeleton_problem

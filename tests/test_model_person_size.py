@@ -14,7 +14,7 @@ from model.fitting.search import find_bodies
 from model.fitting.settings import ScanFitConfig
 from scanprep import Mesh, write_mesh
 from scanprep.geometry import rotations
-from scanprep.judgement import WrongScaleError, check_unit
+from scanprep.plausible import WrongScaleError, check_unit
 from scanprep.registration.unit import resolve_unit
 from scanprep.synthetic.people import BodyShape, SyntheticPerson
 

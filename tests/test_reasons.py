@@ -48,8 +48,8 @@ SAID_BY = {
     "model/statue/own_mesh.py read_pieces": "statue fit",
     "model/statue/motion/motions.py follower_of": "statue animate",
     "scanprep/alignment/views.py views_problem": "prep views",
-    "scanprep/judgement.py ": f"{ON_SCANS}, {ON_MARKERS}",
-    "scanprep/judgement.py unit_problem":
+    "scanprep/plausible.py ": f"{ON_SCANS}, {ON_MARKERS}",
+    "scanprep/plausible.py unit_problem":
         f"{ON_SCANS}, {ON_MARKERS}, learn, prep correspond, prep align, model evaluate, model coregister",
     "scanprep/pipeline/landmarks.py template_and_landmarks": "prep landmarks",
     "scanprep/pipeline/mend.py MendApp.__init__": "prep run",

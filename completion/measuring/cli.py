@@ -25,7 +25,8 @@ from scanprep.geometry.files import write_mesh
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.storage import write_json
 from scanprep.geometry.tables import write_table
-from scanprep.judgement import Judgement, implausible_body
+from scanprep.judgement import Judgement
+from scanprep.plausible import implausible_body
 from scanprep.words import number_of
 
 from ..cli import ModelOrNone, read_model

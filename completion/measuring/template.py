@@ -23,7 +23,7 @@ from scanprep.dataset import RegisteredSet
 from scanprep.geometry.landmark_names import translate_landmarks
 from scanprep.geometry.landmarks import landmarks_beside, read_landmark_vertices
 from scanprep.geometry.mesh import Mesh
-from scanprep.judgement import implausible_body
+from scanprep.plausible import implausible_body
 from scanprep.synthetic.landmarks import landmarks
 from scanprep.synthetic.topology import load_topology
 from scanprep.words import number_of

@@ -31,7 +31,8 @@ from scanprep.geometry.files import check_same_topology, read_mesh, write_mesh
 from scanprep.geometry.geodesics import SurfaceGraph
 from scanprep.geometry.mesh import Mesh, take_any_mesh
 from scanprep.geometry.surface import Surface
-from scanprep.judgement import HAND, UNJUDGED, Judgement, extent, size, unit_problem
+from scanprep.judgement import HAND, UNJUDGED, Judgement, extent, size
+from scanprep.plausible import unit_problem
 from scanprep.registration.ground import foot_of_vertex, put_on_floor
 from scanprep.skeleton.roles import in_words, joint_in_words, part_kind
 from scanprep.skeleton.tree import Skeleton

@@ -11,7 +11,8 @@ from model.fitting.scan import Scan, ScanPoints, all_points, check_mask, prepare
 from scanprep.correspondence.correspondences import check_pairs
 from scanprep.depth_camera.picture import DepthPicture
 from scanprep.geometry.mesh import Mesh
-from scanprep.judgement import check_unit, size
+from scanprep.judgement import size
+from scanprep.plausible import check_unit
 
 from .settings import CompletionConfig
 

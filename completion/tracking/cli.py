@@ -16,7 +16,8 @@ from scanprep.cli import MM, Output, PersonUnit
 from scanprep.console import Metric, Outcome, bar, say
 from scanprep.geometry.farthest_points import spread_indices
 from scanprep.geometry.files import PointCloud
-from scanprep.judgement import Judgement, check_unit, extent, unit_problem
+from scanprep.judgement import Judgement, extent
+from scanprep.plausible import check_unit, unit_problem
 from scanprep.ranges import Positive
 
 from ..cli import ModelOrNone, body_of, read_landmark_pairs, read_model

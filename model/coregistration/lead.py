@@ -18,7 +18,8 @@ from scipy.spatial import cKDTree
 from scanprep.geometry.carrier import SurfaceCarrier, mount
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.surface import Surface
-from scanprep.judgement import WrongScaleError, extent, unit_problem
+from scanprep.judgement import extent
+from scanprep.plausible import WrongScaleError, unit_problem
 from scanprep.ranges import Axis, direction_of
 from scanprep.registration.lead import Proposal
 from scanprep.registration.nonrigid import covers

@@ -13,7 +13,8 @@ from scanprep.batch.opening import workspace
 from scanprep.batch.room import TaskContext
 from scanprep.batch.workspace import Task, Workspace
 from scanprep.geometry.mesh import Mesh
-from scanprep.judgement import extent, unit_problem
+from scanprep.judgement import extent
+from scanprep.plausible import unit_problem
 from scanprep.threads import one_thread
 
 from ..body import BodyModel

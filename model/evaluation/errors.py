@@ -9,7 +9,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from scanprep.judgement import HAND, extent, size, unit_problem
+from scanprep.judgement import HAND, extent, size
+from scanprep.plausible import unit_problem
 from scanprep.words import describe_result
 
 from ..body import BodyModel, Progress

@@ -12,7 +12,7 @@ from scipy.spatial import cKDTree
 
 from scanprep.geometry import rotations
 from scanprep.geometry.least_squares import Dense, levenberg_marquardt, normal_equations
-from scanprep.judgement import ANYBODY, WRONG_UNIT, WrongScaleError
+from scanprep.plausible import ANYBODY, WRONG_UNIT, WrongScaleError
 from scanprep.skeleton.roles import find_numbered_roles
 
 from ..priors import gaussian_prior, typical_poses

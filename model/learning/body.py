@@ -12,7 +12,8 @@ import numpy as np
 from scanprep.batch.room import Step, run_uncached, substeps
 from scanprep.geometry.mesh import Mesh, take_any_mesh
 from scanprep.geometry.upright import find_up
-from scanprep.judgement import Judgement, WrongScaleError
+from scanprep.judgement import Judgement
+from scanprep.plausible import WrongScaleError
 from scanprep.registration.person import has_limbs
 from scanprep.skeleton.joints import joint_gaps
 from scanprep.skeleton.tree import Skeleton

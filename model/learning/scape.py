@@ -16,7 +16,8 @@ from scanprep.geometry.members import ONE_BODY, check_members, find_spikes
 from scanprep.geometry.mesh import Mesh, check_template, take_any_mesh
 from scanprep.geometry.rotations import procrustes
 from scanprep.geometry.upright import find_up
-from scanprep.judgement import HAND, Judgement, extent, size, unit_problem
+from scanprep.judgement import HAND, Judgement, extent, size
+from scanprep.plausible import unit_problem
 from scanprep.skeleton.joints import joint_doubts
 from scanprep.skeleton.names import skeleton_doubts
 from scanprep.skeleton.roles import joint_in_words

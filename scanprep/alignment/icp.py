@@ -10,7 +10,8 @@ from ..geometry import rotations
 from ..geometry.mesh import Mesh, take_any_mesh
 from ..geometry.surface import check_points
 from ..geometry.target import target_of
-from ..judgement import extent, unit_problem
+from ..judgement import extent
+from ..plausible import unit_problem
 from ..ranges import Positive, Settings, SomeShare
 from ..threads import search_threads
 

@@ -15,7 +15,7 @@ from ..correspondence.search import CorrelatedConfig
 from ..geometry.files import read_scan, write_mesh
 from ..geometry.landmarks import check_on_surface, read_landmarks, try_match_landmarks
 from ..geometry.mesh import Mesh
-from ..judgement import WrongScaleError, check_unit, implausible_body
+from ..plausible import WrongScaleError, check_unit, implausible_body
 from ..ranges import FLAG, Settings
 from ..registration.figures import ScanFigures, figures_of
 from ..registration.ground import with_soles

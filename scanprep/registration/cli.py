@@ -23,7 +23,8 @@ from ..geometry.landmarks import (
     try_match_landmarks,
 )
 from ..geometry.mesh import Mesh
-from ..judgement import Judgement, check_unit
+from ..judgement import Judgement
+from ..plausible import check_unit
 from .ground import soles_row, with_soles
 from .lead import lead_of
 from .matches import Landmarks

@@ -22,7 +22,8 @@ from ..geometry.mesh import Mesh
 from ..geometry.places import point_areas
 from ..geometry.surface import OrientedPoints, Surface, check_points
 from ..geometry.target import Target, orient_by_mesh
-from ..judgement import HAND, UNJUDGED, Judgement, extent, size, unit_problem
+from ..judgement import HAND, UNJUDGED, Judgement, extent, size
+from ..plausible import unit_problem
 from ..threads import one_thread
 from ..words import describe_result
 from .final_fit import final_fit

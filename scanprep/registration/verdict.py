@@ -9,7 +9,8 @@ from typing import Any, TypeVar, cast
 import numpy as np
 
 from ..geometry.mesh import Mesh, take_any_mesh
-from ..judgement import Judgement, implausible_body, size
+from ..judgement import Judgement, size
+from ..plausible import implausible_body
 from .figures import ONE_VIEW, UNSEEN, figures_of, review
 from .limbs import find_exchanged_sides, hidden_doubts, limb_doubts
 from .matches import Landmarks

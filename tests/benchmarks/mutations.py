@@ -187,7 +187,7 @@ MUTATIONS = (
     *of("scanprep/geometry/format_common.py", "scanprep_geometry_points scanprep_geometry_files",
         ("inches ten times too long", '"in": 0.0254', '"in": 0.254'),
         ("centimetres as decimetres", '"cm": 1e-2', '"cm": 1e-1')),
-    *of("scanprep/judgement.py", "judgement",
+    *of("scanprep/plausible.py", "judgement",
         ("betas of one standard deviation only", "2 * gammainccinv", "gammainccinv"),
         ("likely betas fail", "length > TOO_LONG * most", "length < TOO_LONG * most"),
         ("usual betas by their number", "USUAL**2 * count", "USUAL**2 * count**2"),

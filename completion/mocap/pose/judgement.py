@@ -7,7 +7,8 @@ import numpy as np
 
 from scanprep.console import Metric
 from scanprep.geometry.mesh import Mesh
-from scanprep.judgement import HAND, Judgement, extent, size, unit_problem
+from scanprep.judgement import HAND, Judgement, extent, size
+from scanprep.plausible import unit_problem
 
 from ...motion import Motion
 from ..files.markers import MarkerSequence
