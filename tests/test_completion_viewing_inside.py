@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from browser import wait_until, watched
+from click_app import allowed
 from completion_bodies import MARKS, POSE, QUICK, TRANS, half_view, worm_with_prior
 from PIL import Image
 from test_completion_depth_picture import AWAY, taken
@@ -181,7 +182,7 @@ def test_a_set_is_mended_from_the_view(place):  # noqa: F811
     before = app.contents[app.shown[0]]
     page = entered(app, what="mend", folder=one[0]["folder"])
     assert page.name == "mend" and page.scans[0].file.name == "body1" + ENDING
-    mend(page, place)
+    mend(allowed(page), place)
     page.handle(Message("register", {}), lambda message: None)
     wait_for(page)
     app.on_return(page)

@@ -61,7 +61,9 @@ def find_scans(folder: str | Path, landmarks: str | Path | None = None, subject:
                          f"{', '.join(list(paths)[:5])}")
     if landmarks and not means_none(landmarks) and not Path(landmarks).is_dir():
         raise ValueError(f"landmarks: expected a folder, there is none at {landmarks}")
-    places = [folder / "landmarks", folder] if not landmarks else [] if means_none(landmarks) else [Path(landmarks)]
+    # what is clicked is written there, so a link that leads out of the folder has to be named
+    places = [storage.path_inside(folder, "landmarks", "--landmarks"), folder] if not landmarks else \
+        [] if means_none(landmarks) else [Path(landmarks)]
     # join each file with its row of the table and its landmark file
     tasks = []
     for name, path in sorted(paths.items()):
