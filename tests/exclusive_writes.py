@@ -15,6 +15,9 @@ class ExclusiveWrites:
         self.wrong, self.made, self.folders = [], set(), set()
         sys.addaudithook(self._hear)
 
+    def opened(self, path):
+        """Take note of a file that is opened for writing, where a test wants to know."""
+
     def _hear(self, event, args):
         if event == "open" and isinstance(args[0], str | bytes | os.PathLike) and isinstance(args[2], int):
             self._opened(os.path.abspath(os.fsdecode(args[0])), args[2])
@@ -26,6 +29,7 @@ class ExclusiveWrites:
     def _opened(self, path, flags):
         if not flags & WRITES or path == os.devnull:
             return
+        self.opened(path)
         if flags & os.O_EXCL:
             self.made.add(path)
         elif path not in self.made and not self._in_new_folder(path) and (frame := _our_frame()) is not None \
