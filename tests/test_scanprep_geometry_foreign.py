@@ -3,16 +3,14 @@ import base64
 import json
 import struct
 import warnings
-import zipfile
 
 import numpy as np
 import pytest
-import trimesh
-from mesh_files import TETRAHEDRON, body, quiet, refused
+from mesh_files import TETRAHEDRON, quiet, refused
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
-from scanprep.geometry.files import list_meshes, read_mesh, read_points, read_scan, write_mesh
+from scanprep.geometry.files import read_mesh, read_points, read_scan, write_mesh
 from scanprep.geometry.mesh import Mesh
 from scanprep.pictures.textures import read_texture
 from scanprep.pipeline.scans import find_scans
@@ -342,151 +340,28 @@ def test_skinned_meshes_stand_where_their_joints_carry_them(tmp_path):
     np.testing.assert_allclose(mesh.vertices[4:], TETRAHEDRON.vertices + [3, 0, 0], atol=1e-6)
 
 
-# ---- Draco, MeshLab
+# ---- formats that are not read
 
-def test_draco_in_files_of_its_own_and_in_gltf(tmp_path):
-    DracoPy = pytest.importorskip("DracoPy", reason="draco is an extra")
-    mesh = body(np.random.default_rng(3))
-    packed = DracoPy.encode(mesh.vertices.astype("f4"), mesh.faces.astype("u4"), quantization_bits=20)
-    (tmp_path / "a.drc").write_bytes(packed)
-    back = read_mesh(tmp_path / "a.drc")
-    assert len(back.faces) == len(mesh.faces) and back.is_closed
-    volume = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False).volume
-    assert trimesh.Trimesh(back.vertices, back.faces, process=False).volume == pytest.approx(volume, rel=1e-4)
-    tree, _ = gltf(ONE, [CORNERS, LINE, np.frombuffer(packed, "u1")])
+def test_a_gltf_of_draco_names_the_export_that_works(tmp_path):
+    tree, _ = gltf(ONE, [CORNERS, LINE, np.zeros(9, "u1")])
     tree["meshes"][0]["primitives"][0] = {**PRIMITIVE, "extensions": {"KHR_draco_mesh_compression": {
-        "bufferView": 2, "attributes": {"POSITION": DracoPy.decode(packed).attributes[0]["unique_id"]}}}}
-    tree["accessors"][0] = {"componentType": 5126, "count": len(mesh.vertices), "type": "VEC3"}
-    tree["accessors"][1] = {"componentType": 5125, "count": 3 * len(mesh.faces), "type": "SCALAR"}
-    (tmp_path / "a.gltf").write_text(json.dumps({**tree, "extensionsRequired": ["KHR_draco_mesh_compression"]}))
-    same(read_mesh(tmp_path / "a.gltf"), back, 0)
+        "bufferView": 2, "attributes": {"POSITION": 0}}}}
+    (tmp_path / "a.gltf").write_text(json.dumps({**tree, "extensionsUsed": ["KHR_draco_mesh_compression"]}))
+    same(read_mesh(tmp_path / "a.gltf"), TETRAHEDRON)            # with a copy that is not packed
+    del tree["accessors"][0]["bufferView"]
+    (tmp_path / "a.gltf").write_text(json.dumps(tree))
+    refused(tmp_path / "a.gltf", "it needs KHR_draco_mesh_compression", "without compression")
 
 
-def test_without_dracos_library_the_extra_is_named(tmp_path, monkeypatch):
-    monkeypatch.setitem(__import__("sys").modules, "DracoPy", None)
-    (tmp_path / "a.drc").write_bytes(b"DRACO")
-    refused(tmp_path / "a.drc", "pip install 'scapekit[draco]'")
-
-
-@pytest.mark.gl
-def test_other_formats_are_read_through_meshlab(tmp_path):
-    pymeshlab = pytest.importorskip("pymeshlab")
-    mesh, meshes = body(np.random.default_rng(4)), pymeshlab.MeshSet()
-    meshes.add_mesh(pymeshlab.Mesh(mesh.vertices, mesh.faces.astype(np.int32)))
-    meshes.save_current_mesh(str(tmp_path / "a.3ds"))
-    with pytest.warns(UserWarning, match="read through MeshLab; the order"):
-        back = read_mesh(tmp_path / "a.3ds")
-    np.testing.assert_allclose(np.sort(back.face_areas), np.sort(mesh.face_areas), atol=1e-5)
-    assert [path.name for path in list_meshes(tmp_path)] == ["a.3ds"]
-    assert [task.name for task in find_scans(tmp_path)] == ["a"]
-    (tmp_path / "b.3ds").write_bytes(b"nothing of the kind")
-    refused(tmp_path / "b.3ds", "MeshLab cannot read it")
-
-
-# ---- COLLADA, 3MF
-
-def collada(faces, nodes, library="", unit="0.01"):
-    """A square of four vertices with a colour each, how its triangles are told, and the nodes of the scene."""
-    def source(name, rows):
-        numbers = " ".join(f"{x:g}" for x in rows.ravel())
-        return (f'<source id="{name}"><float_array id="{name}-array">{numbers}</float_array><technique_common>'
-                f'<accessor source="#{name}-array" count="{len(rows)}" stride="3"/></technique_common></source>')
-    return (f'<?xml version="1.0"?><COLLADA xmlns="http://www.collada.org/2005/11/COLLADASchema" version="1.4.1">'
-            f'<asset><unit meter="{unit}"/></asset><library_geometries><geometry id="g"><mesh>'
-            f'{source("p", SQUARE)}{source("c", SQUARE / 2)}<vertices id="v"><input semantic="POSITION" source="#p"/>'
-            f'</vertices>{faces}</mesh></geometry></library_geometries>{library}<library_visual_scenes>'
-            f'<visual_scene id="s">{nodes}</visual_scene></library_visual_scenes><scene>'
-            f'<instance_visual_scene url="#s"/></scene></COLLADA>')
-
-
-INPUTS = '<input semantic="VERTEX" source="#v" offset="0"/><input semantic="COLOR" source="#c" offset="1"/>'
-SHOWN = '<node id="n" name="square">{}<instance_geometry url="#g"/></node>'
-TWO = [[0, 1, 2], [2, 1, 3]]
-
-
-@pytest.mark.parametrize(("faces", "right"), [
-    (f'<triangles count="2">{INPUTS}<p>0 0 1 1 2 2 2 2 1 1 3 3</p></triangles>', TWO),
-    (f'<tristrips count="1">{INPUTS}<p>0 0 1 1 2 2 3 3</p></tristrips>', TWO),
-    (f'<trifans count="1">{INPUTS}<p>1 1 3 3 2 2 0 0</p></trifans>', [[1, 3, 2], [1, 2, 0]]),
-    (f'<polylist count="1">{INPUTS}<vcount>4</vcount><p>0 0 1 1 3 3 2 2</p></polylist>', [[0, 1, 3], [0, 3, 2]]),
-    (f'<polygons count="1">{INPUTS}<p>0 0 1 1 3 3 2 2</p></polygons>', [[0, 1, 3], [0, 3, 2]])])
-def test_collada_has_triangles_in_five_ways(tmp_path, faces, right):
-    (tmp_path / "a.dae").write_text(collada(faces, SHOWN.format("")))
-    with pytest.warns(UserWarning, match=r"says that its unit is 0\.01 m"):
-        mesh = read_mesh(tmp_path / "a.dae")
-    assert mesh.faces.tolist() == right
-    np.testing.assert_allclose(mesh.vertices, 0.01 * SQUARE)
-    np.testing.assert_allclose(mesh.colors, SQUARE / 2)
-    np.testing.assert_allclose(quiet(read_mesh, tmp_path / "a.dae", "m").vertices, SQUARE)
-
-
-@pytest.mark.parametrize(("place", "right"), [
-    ("<scale>2 2 2</scale>", 2 * SQUARE),
-    ("<translate>10 0 0</translate><scale>2 2 2</scale><translate>1 0 0</translate>", 2 * SQUARE + [12, 0, 0]),
-    ("<translate>0,5 0 0</translate><rotate>0 0 2 90</rotate>", SQUARE[:, [1, 0, 2]] * [-1, 1, 1] + [0.5, 0, 0]),
-    ("<matrix>2 0 0 7 0 2 0 0 0 0 2 0 0 0 0 1</matrix>", 2 * SQUARE + [7, 0, 0])])
-def test_transforms_of_collada_follow_one_another(tmp_path, place, right):
-    """MeshLab's reader drops scales and all but the last translation."""
-    faces = f'<triangles count="2">{INPUTS}<p>0 0 1 1 2 2 2 2 1 1 3 3</p></triangles>'
-    (tmp_path / "a.dae").write_text(collada(faces, SHOWN.format(place)))
-    np.testing.assert_allclose(quiet(read_mesh, tmp_path / "a.dae", "m").vertices, right, atol=1e-12)
-
-
-def test_nodes_of_collada_may_be_shown_again_but_not_without_end(tmp_path):
-    faces = f'<triangles count="2">{INPUTS}<p>0 0 1 1 2 2 2 2 1 1 3 3</p></triangles>'
-    shelf = f"<library_nodes>{SHOWN.format('')}</library_nodes>"
-    twice = '<node><translate>5 0 0</translate><instance_node url="#n"/></node><node><instance_node url="#n"/></node>'
-    (tmp_path / "a.dae").write_text(collada(faces, twice, shelf))
-    np.testing.assert_allclose(quiet(read_mesh, tmp_path / "a.dae", "m").vertices, np.r_[SQUARE + [5, 0, 0], SQUARE])
-    (tmp_path / "a.dae").write_text(collada(faces, '<node id="n"><instance_node url="#n"/></node>'))
-    refused(tmp_path / "a.dae", "without end")
-    (tmp_path / "a.dae").write_text('<!DOCTYPE a [<!ENTITY b "c">]><COLLADA/>')
-    refused(tmp_path / "a.dae", "a whole COLLADA file", "entities")
-
-
-def build_3mf(path, objects, items, unit=' unit="centimeter"', **others):
-    def model(inside, build):
-        return ('<?xml version="1.0"?><model xmlns="http://schemas.microsoft.com/3dmanufacturing/core/2015/02" '
-                f'xmlns:p="http://schemas.microsoft.com/3dmanufacturing/production/2015/06"{unit}>'
-                f"<resources>{inside}</resources><build>{build}</build></model>")
-    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
-        archive.writestr("_rels/.rels", '<Relationships><Relationship Type="http://x/3dmodel" Target="/3D/a.model"/>'
-                                        "</Relationships>")
-        archive.writestr("3D/a.model", model(objects, items))
-        for name, inside in others.items():
-            archive.writestr(f"3D/{name}.model", model(inside, ""))
-
-
-def object_3mf(number, kind="model"):
-    vertices = "".join(f'<vertex x="{x:g}" y="{y:g}" z="{z:g}"/>' for x, y, z in SQUARE)
-    triangles = "".join(f'<triangle v1="{a}" v2="{b}" v3="{c}"/>' for a, b, c in TWO)
-    return (f'<object id="{number}" type="{kind}"><mesh><vertices>{vertices}</vertices><triangles>{triangles}'
-            f"</triangles></mesh></object>")
-
-
-def test_3mf_is_built_of_components_in_its_unit(tmp_path):
-    whole = ('<object id="7"><components><component objectid="1" transform="0 1 0 -1 0 0 0 0 1 3 0 0"/>'
-             '<component p:path="/3D/other.model" objectid="1"/></components></object>')
-    build_3mf(tmp_path / "a.3mf", object_3mf(1) + object_3mf(2, "support") + whole,
-              '<item objectid="7" transform="2 0 0 0 2 0 0 0 2 0 0 0"/><item objectid="2"/>', other=object_3mf(1))
-    mesh = quiet(read_mesh, tmp_path / "a.3mf")
-    turned = SQUARE[:, [1, 0, 2]] * [-1, 1, 1] + [3, 0, 0]
-    np.testing.assert_allclose(mesh.vertices, 0.01 * 2 * np.r_[turned, SQUARE])
-    assert mesh.faces.tolist() == [*TWO, *(np.array(TWO) + 4).tolist()]
-    build_3mf(tmp_path / "a.3mf", object_3mf(1), '<item objectid="1"/>', unit="")
-    np.testing.assert_allclose(quiet(read_mesh, tmp_path / "a.3mf").vertices, 0.001 * SQUARE)
-
-
-def test_3mf_that_holds_no_mesh_or_itself_is_refused(tmp_path):
-    build_3mf(tmp_path / "a.3mf", '<object id="1"><components><component objectid="1"/></components></object>',
-              '<item objectid="1"/>')
-    refused(tmp_path / "a.3mf", "without end")
-    build_3mf(tmp_path / "a.3mf", object_3mf(1), "")
-    refused(tmp_path / "a.3mf", "found no triangles")
-    (tmp_path / "a.3mf").write_bytes(b"nothing of the kind")
-    refused(tmp_path / "a.3mf", "a whole 3MF file")
-    build_3mf(tmp_path / "a.3mf", " " * 2**25, "")
-    refused(tmp_path / "a.3mf", "unpack to far more")
+@pytest.mark.parametrize(("name", "program"), [
+    ("a.dae", "Blender"), ("a.3mf", "MeshLab"), ("a.wrl", "MeshLab"), ("a.E57", "CloudCompare"),
+    ("a.drc", "draco_decoder"), ("a.fbx", "Blender")])
+def test_formats_that_are_not_read_name_the_export_that_works(tmp_path, name, program):
+    (tmp_path / name).write_bytes(b"anything")
+    refused(tmp_path / name, program, "makes")
+    write_mesh(tmp_path / "b.ply", TETRAHEDRON)
+    with pytest.warns(UserWarning, match=rf"{name}.*{program}"):
+        assert [task.name for task in find_scans(tmp_path)] == ["b"]
 
 
 # ---- textures

@@ -8,10 +8,11 @@ import numpy as np
 
 from scanprep.console import Metric
 from scanprep.geometry import format_glb as glb
+from scanprep.geometry.budget import reading, spend
 from scanprep.geometry.files import read_scan
-from scanprep.geometry.format_common import Contents, load_bytes
+from scanprep.geometry.format_common import Contents, MeshFileError, load_bytes, polygons
 from scanprep.geometry.mesh import Mesh
-from scanprep.geometry.storage import StorageError, write_file
+from scanprep.geometry.storage import StorageError, check_regular, taking_apart, write_file
 from scanprep.geometry.surface import Surface
 from scanprep.pictures.textures import load_with_materials
 
@@ -39,7 +40,7 @@ class PlacedPrimitive(NamedTuple):
     """A primitive of a glTF file where it stands in the scene."""
 
     primitive: dict[str, Any]
-    tree: dict[str, Any]           # with the accessors of its attributes; its own where it was compressed
+    tree: dict[str, Any]           # with the accessors of its attributes
     binary: bytes
     motion: np.ndarray             # (n, 4, 4) or (1, 4, 4), from its numbers to the scene, metres
 
@@ -143,15 +144,22 @@ def write_own_mesh(path: Path, source: Path, metres: float, statue: Statue, name
 def read_pieces(source: Path, upright: int, metres: float) -> tuple[dict[str, Any], bytes, int, Shapes]:
     """Read any mesh file as glTF: its tree and buffer, the axis that was turned to y, and its surface in metres.
 
-    `upright` is the axis of the file that points up, unless the file is glTF. ValueError for one without triangles.
+    `upright` is the axis of the file that points up, unless the file is glTF. MeshFileError for one that is damaged or
+    has no triangles.
     """
-    tree, binary = read_as_gltf(source)
-    up = glb.up_of(tree) if source.suffix.lower() in (".glb", ".gltf") else upright
-    frame = np.diag([metres] * 3 + [1.0])
-    frame[:3, :3] = metres * turn_up(up) @ turn_up(glb.up_of(tree)).T
-    shapes = place_pieces(source, tree, binary, frame)
+    check_regular(source, MeshFileError)
+    with reading(source, MeshFileError), taking_apart(source, "a whole mesh file", MeshFileError):
+        tree, binary = read_as_gltf(source)
+        up = glb.up_of(tree) if source.suffix.lower() in (".glb", ".gltf") else upright
+        frame = np.diag([metres] * 3 + [1.0])
+        frame[:3, :3] = metres * turn_up(up) @ turn_up(glb.up_of(tree)).T
+        shapes = place_pieces(tree, binary, frame)
+        # all of it is read before the fit, which takes minutes
+        for piece in (piece for _, pieces in shapes for piece in pieces):
+            polygons(source, np.full(len(piece.triangles), 3), piece.triangles.ravel(), len(piece.read("POSITION")))
+            rewrite(glb.Glb(), tree, binary, piece, np.ones((len(piece.read("POSITION")), 1)))
     if not shapes:
-        raise ValueError(f"{source}: expected triangles for --own-mesh, found none; leave it out")
+        raise MeshFileError(f"{source}: expected triangles for --own-mesh, found none; leave it out")
     return tree, binary, up, shapes
 
 
@@ -209,13 +217,12 @@ def read_as_gltf(path: Path) -> tuple[dict[str, Any], bytes]:
     else:
         mesh = read_scan(path, "m")
         if not isinstance(mesh, Mesh):
-            raise ValueError(f"{path}: expected triangles for --own-mesh, found points; leave it out")
+            raise MeshFileError(f"{path}: expected triangles for --own-mesh, found points; leave it out")
         data = glb.encode(Contents(mesh.vertices, mesh.faces, None, mesh.colors), False)
     return glb.chunks_of(path, data)
 
 
-def place_pieces(path: Path, tree: dict[str, Any], binary: bytes, frame: np.ndarray
-                 ) -> Shapes:
+def place_pieces(tree: dict[str, Any], binary: bytes, frame: np.ndarray) -> Shapes:
     """List the nodes with a mesh, and their primitives of triangles as they stand in the scene, turned by a frame."""
     nodes = [(number, node, frame @ matrix) for number, node, matrix in glb.nodes_of(tree)]
     places, out = {number: matrix for number, _, matrix in nodes}, []
@@ -229,11 +236,13 @@ def place_pieces(path: Path, tree: dict[str, Any], binary: bytes, frame: np.ndar
             for primitive in glb.item(tree["meshes"], node["mesh"])["primitives"]:
                 if primitive.get("mode", 4) not in (4, 5, 6):             # triangles, strips, fans
                     continue
-                decoded, own, data = glb.decode_primitive(path, tree, binary, primitive)
+                spend(visits=1)
                 motion = instance[None]
-                if joints is not None and "JOINTS_0" in decoded["attributes"]:
-                    motion = np.einsum("nj,jab->nab", glb.weights_of(own, data, decoded, len(joints)), joints)
-                pieces.append(PlacedPrimitive({**primitive, **decoded}, own, data, motion))
+                if joints is not None and "JOINTS_0" in primitive["attributes"]:
+                    weights = glb.weights_of(tree, binary, primitive, len(joints))
+                    spend(memory=128 * len(weights))
+                    motion = np.einsum("nj,jab->nab", weights, joints)
+                pieces.append(PlacedPrimitive(primitive, tree, binary, motion))
         out += [(node, pieces)] if pieces else []
     return out
 

@@ -1,11 +1,10 @@
-"""Filters and readers of MeshLab. As a program, `python -m ... FILE OUT.npz`, it reads one file.
+"""Filters of MeshLab.
 
 pymeshlab is licensed under the GPL, version 3. It is imported in this file alone, when one of these functions is
 called; a program that distributes pymeshlab together with this package must respect that licence.
 """
 from __future__ import annotations
 
-import sys
 from typing import Any
 
 import numpy as np
@@ -30,23 +29,6 @@ def meshlab_poisson(mesh: Mesh, depth: int = 8) -> Mesh:
     return recolor(_result(meshes), mesh)
 
 
-def read_layers(path: str) -> dict[str, np.ndarray]:
-    """Read vertices, triangles, colours and names of all layers of a file with MeshLab, each layer in its place."""
-    meshes = library("pymeshlab").MeshSet()
-    meshes.load_new_mesh(path)
-    layers = list(meshes)
-    counts = [layer.vertex_number() for layer in layers]
-    starts = np.cumsum([0, *counts[:-1]])
-    arrays = {"vertices": np.concatenate([layer.transformed_vertex_matrix() for layer in layers]),
-              "faces": np.concatenate([layer.face_matrix().astype(np.int64) + start
-                                       for layer, start in zip(layers, starts, strict=True)]),
-              "names": np.array([layer.label() or f"layer {k}" for k, layer in enumerate(layers)]),
-              "triangles": np.array([layer.face_number() for layer in layers])}
-    if all(layer.has_vertex_color() for layer in layers):
-        arrays["colors"] = np.concatenate([layer.vertex_color_matrix()[:, :3] for layer in layers])
-    return arrays
-
-
 def _meshes(mesh: Mesh) -> Any:
     """Put a mesh into a MeshSet."""
     pymeshlab = library("pymeshlab")
@@ -60,8 +42,3 @@ def _result(meshes: Any) -> Mesh:
     """Return the current mesh of a MeshSet."""
     current = meshes.current_mesh()
     return Mesh(current.vertex_matrix(), current.face_matrix())
-
-
-if __name__ == "__main__":
-    arrays: dict[str, Any] = read_layers(sys.argv[1])
-    np.savez(sys.argv[2], **arrays)

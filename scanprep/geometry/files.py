@@ -17,17 +17,8 @@ from typing import Literal, NamedTuple
 import numpy as np
 
 from ..words import number_of
-from . import (
-    format_draco,
-    format_foreign,
-    format_glb,
-    format_pcd,
-    format_ply,
-    format_stl,
-    format_text,
-    format_xml,
-    storage,
-)
+from . import format_glb, format_pcd, format_ply, format_stl, format_text, storage
+from .budget import reading
 from .format_common import (
     UNITS,
     Contents,
@@ -87,16 +78,20 @@ _MESHES = {".ply": _Format(format_ply.read, format_ply.encode),
            ".obj": _Format(format_text.read_obj, format_text.encode_obj),
            ".stl": _Format(format_stl.read, format_stl.encode),
            ".off": _Format(format_text.read_off, format_text.encode_off),
-           ".glb": _Format(format_glb.read, format_glb.encode), ".gltf": _Format(format_glb.read_gltf),
-           ".drc": _Format(format_draco.read),
-           ".dae": _Format(format_xml.read_dae), ".3mf": _Format(format_xml.read_3mf),
-           **{ending: _Format(format_foreign.read) for ending in format_foreign.MESHES}}
+           ".glb": _Format(format_glb.read, format_glb.encode), ".gltf": _Format(format_glb.read_gltf)}
 _POINTS = {".pcd": _Format(format_pcd.read, format_pcd.encode), ".xyz": _ROWS, ".pts": _ROWS, ".txt": _ROWS,
-           ".asc": _Format(format_text.read_xyz), ".csv": _Format(format_text.read_xyz),
-           **{ending: _Format(format_foreign.read) for ending in format_foreign.POINTS}}
+           ".asc": _Format(format_text.read_xyz), ".csv": _Format(format_text.read_xyz)}
 _FORMATS = {**_MESHES, **_POINTS}
 
 ENDINGS = tuple(_FORMATS)
+# formats that are not read, with the export of a program that reads them
+_EXPORTS = {**dict.fromkeys((".fbx", ".blend", ".usd", ".usda", ".usdc", ".usdz"),
+                            "Blender (File > Open or Import, then Export) makes GLB of it"),
+            ".dae": "Blender up to 4.5 (File > Import, then Export) makes GLB of it",
+            **dict.fromkeys((".3mf", ".3ds", ".x3d", ".x3dv", ".wrl", ".ctm", ".qobj"),
+                            "MeshLab (File > Import Mesh, then Export Mesh As) makes PLY of it"),
+            **dict.fromkeys((".e57", ".ptx", ".las", ".laz"), "CloudCompare (File > Save as) makes PLY of it"),
+            ".drc": "draco_decoder (-i FILE.drc -o FILE.ply) makes PLY of it"}
 # in a folder, text may be notes and tables as well as points
 SCAN_ENDINGS = tuple(ending for ending in ENDINGS if ending not in (".txt", ".csv"))
 
@@ -113,8 +108,7 @@ def read_mesh(path: str | Path, unit: str | None = None) -> Mesh:
     Parameters
     ----------
     path : str or Path
-        PLY, OBJ, STL, OFF, GLB, glTF, COLLADA (`.dae`), 3MF or Draco (`.drc`), also packed as `.ply.gz`. With
-        pymeshlab also 3DS, X3D, WRL and CTM.
+        PLY, OBJ, STL, OFF, GLB or glTF, also packed as `.ply.gz`.
     unit : 'm', 'mm', 'cm' or 'in', optional
         Unit of the file. By default the unit that the file names. Else the unit in which the mesh is as large as a
         person, with a UserWarning. Else metres, with a UserWarning above 10 m or below 0.1 m.
@@ -227,8 +221,7 @@ def read_points(path: str | Path, unit: str | None = None) -> PointCloud:
     Parameters
     ----------
     path : str or Path
-        PLY, PCD, text (`.xyz`, `.txt`, `.pts`, `.asc`, `.csv`), with pymeshlab E57 and PTX, or any format of
-        `read_mesh`.
+        PLY, PCD, text (`.xyz`, `.txt`, `.pts`, `.asc`, `.csv`), or any format of `read_mesh`.
     unit : 'm', 'mm', 'cm' or 'in', optional
         As for `read_mesh`.
 
@@ -310,6 +303,11 @@ def write_points(path: str | Path, cloud: PointCloud) -> None:
     _write(Path(path), contents, "double", {".ply": _MESHES[".ply"], **_POINTS})
 
 
+def advice(path: Path) -> str:
+    """Return how a file of a known format that is not read gets readable; empty for any other file."""
+    return _EXPORTS.get(ending_of(path), "")
+
+
 def is_scan(path: Path) -> bool:
     """Test whether a name is that of a mesh or a point cloud."""
     return ending_of(path) in SCAN_ENDINGS
@@ -377,8 +375,9 @@ def _read(path: Path) -> Contents:
     ending = ending_of(path)
     if ending not in _FORMATS:           # checked before the contents, which may be empty
         raise MeshFileError(f"{path}: expected a name ending in {', '.join(ENDINGS)}, found {ending or 'none'!r}"
-                            f"{format_foreign.advice(ending)}")
-    contents = _FORMATS[ending].read(path, load_bytes(path))
+                            + (advice(path) and f"; {advice(path)}"))
+    with reading(path, MeshFileError):
+        contents = _FORMATS[ending].read(path, load_bytes(path))
     if not len(contents.vertices):
         raise EmptyFileError(f"{path}: the file holds no vertices")
     contents = _finite(path, contents)

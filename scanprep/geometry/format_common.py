@@ -13,6 +13,7 @@ import numpy as np
 
 from ..words import number_of
 from . import storage
+from .budget import memory_for, reading, spend
 
 FARTHEST = 1e9                       # largest coordinate in any unit; no scan has more
 UNITS = {"m": 1.0, "mm": 1e-3, "cm": 1e-2, "in": 0.0254}
@@ -45,9 +46,12 @@ class Contents:
 
 def load_bytes(path: Path) -> bytes:
     """Read a whole file, unpacked if it ends in `.gz`; MeshFileError if it is missing, damaged or empty."""
-    data = storage.read_bytes(path, error=MeshFileError)
-    if path.suffix.lower() == ".gz":
-        data = _unpack(path, data)
+    storage.check_regular(path, MeshFileError)
+    with reading(path, MeshFileError):
+        data = storage.read_bytes(path, error=MeshFileError)
+        if path.suffix.lower() == ".gz":
+            data = _unpack(path, data)
+        spend(memory=len(data))
     if not data:
         raise EmptyFileError(f"{path}: the file is empty")
     return data
@@ -55,8 +59,7 @@ def load_bytes(path: Path) -> bytes:
 
 def _unpack(path: Path, data: bytes) -> bytes:
     """Unpack a gzip file, up to a limit that no real mesh reaches."""
-    # 1 MB plus 50 times the packed size: beyond that it is a decompression bomb
-    most = 2**20 + 50 * len(data)
+    most = memory_for(len(data)) // 4          # a mesh in memory takes about four times its file
     try:
         with gzip.GzipFile(fileobj=io.BytesIO(data)) as packed:
             out = packed.read(most + 1)
@@ -168,6 +171,7 @@ class Lines:
 
     def __init__(self, path: Path, data: bytes, first: int = 1, comment: bytes | None = None) -> None:
         self.path = path
+        spend(memory=64 * (data.count(b"\n") + data.count(b"\r")))         # objects of Python, and a place in a list
         lines = data.splitlines()
         if comment is not None and comment in data:
             lines = [line.split(comment, 1)[0] for line in lines]
@@ -302,12 +306,18 @@ def _cuts_that_meet_nothing(sizes: np.ndarray, corners: np.ndarray, count: int) 
         ring, n = corners[start[p]:start[p] + sizes[p]], int(sizes[p])
         if len(rings[p]) < n:                # repeated corners: it meets itself anyway, and trying all corners is slow
             continue
-        ways = [_edge_key(ring[k], ring[(k + np.arange(2, n - 1)) % n], count).tolist() for k in range(n)]
-        # duplicate polygons meet whatever the corner, so they do not count
-        met = [sum(not (rings[q] <= rings[p] or rings[p] <= rings[q]) for key in way for q in users.get(key, ()))
-               for way in ways]
-        first[p] = int(np.argmin(met))
-        for key in ways[first[p]]:
+        fewest, way = np.inf, list[int]()
+        for k in range(n):
+            keys = _edge_key(ring[k], ring[(k + np.arange(2, n - 1)) % n], count).tolist()
+            others = [q for key in keys for q in users.get(key, ())]
+            spend(memory=40 * (n + len(others)))
+            # duplicate polygons meet whatever the corner, so they do not count
+            met = sum(not (rings[q] <= rings[p] or rings[p] <= rings[q]) for q in others)
+            if met < fewest:
+                fewest, first[p], way = met, k, keys
+            if not met:
+                break
+        for key in way:
             users.setdefault(key, []).append(int(p))
     return first
 

@@ -17,10 +17,12 @@ from urllib.parse import unquote
 
 import numpy as np
 
-from . import format_draco, storage
+from . import storage
+from .budget import spend
 from .format_common import Contents, MeshFileError, as_light, as_seen, load_bytes, polygons, quote, strip_triangles
 from .mesh import Mesh
 
+WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT4": 16}
 _COMPONENTS = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 VERTICES, _INDICES = 34962, 34963     # glTF buffer targets: vertex attributes, indices
 _NUMBERS = {np.dtype(kind).str: number for number, kind in _COMPONENTS.items()}
@@ -29,7 +31,7 @@ GENERATOR = "scapekit"
 
 _DRACO, _INSTANCES = "KHR_draco_mesh_compression", "EXT_mesh_gpu_instancing"
 # required extensions that are supported, and prefixes of those that do not change triangles
-_KNOWN = (_DRACO, _INSTANCES, "KHR_mesh_quantization")
+_KNOWN = (_INSTANCES, "KHR_mesh_quantization")
 _HARMLESS = ("KHR_materials_", "KHR_texture_", "EXT_texture_", "MSFT_texture_", "KHR_lights_", "EXT_lights_",
              "KHR_animation_", "KHR_xmp", "KHR_technique")
 
@@ -60,7 +62,22 @@ def read_tree(path: Path, data: bytes) -> tuple[dict[str, Any], bytes]:
     with storage.taking_apart(path, "a whole glTF file", MeshFileError):
         if not str(tree["asset"]["version"]).startswith("2"):
             raise MeshFileError(f"{path}: expected glTF version 2, found version {tree['asset']['version']}")
+        _check_extensions(path, tree)
         return tree, _one_buffer(path, tree, b"")
+
+
+def _check_extensions(path: Path, tree: dict[str, Any]) -> None:
+    """Raise MeshFileError where the triangles need an extension that is not read here."""
+    needed = {str(name) for name in tree.get("extensionsRequired", [])}
+    for mesh in tree.get("meshes", []):
+        for primitive in mesh["primitives"]:
+            packed = _DRACO in primitive.get("extensions", {})
+            if packed and "bufferView" not in item(tree["accessors"], primitive["attributes"]["POSITION"]):
+                needed.add(_DRACO)           # without a copy that is not packed
+    unknown = sorted(name for name in needed if name not in _KNOWN and not name.startswith(_HARMLESS))
+    if unknown:
+        raise MeshFileError(f"{path}: it needs {', '.join(unknown)}, which is not read here; Blender (File > Import, "
+                            "then Export, without compression) makes a GLB that is")
 
 
 def _one_buffer(path: Path, tree: dict[str, Any], binary: bytes) -> bytes:
@@ -94,16 +111,11 @@ def file_beside(path: Path, name: str) -> Path:
 
 def _scene(path: Path, tree: dict[str, Any], binary: bytes) -> Contents:
     """Collect vertices, triangles and colours of all nodes of the scene."""
-    needed = [str(name) for name in tree.get("extensionsRequired", [])]
-    unknown = [name for name in needed if name not in _KNOWN and not name.startswith(_HARMLESS)]
-    if unknown:
-        raise MeshFileError(f"{path}: it needs {', '.join(unknown)}, which is not read here "
-                            f"(known: {', '.join(_KNOWN)}); save it without, for example with Blender")
     vertices: list[np.ndarray] = []
     faces: list[np.ndarray] = []
     colors: list[np.ndarray | None] = []
     objects: list[tuple[str, int]] = []
-    start, most = 0, 10**6 + 4 * len(binary)    # nodes may share a mesh, but not without limit
+    start = 0
     nodes = list(nodes_of(tree))
     places = {number: matrix for number, _, matrix in nodes}
     kinds = {p.get("mode", 4) for mesh in tree.get("meshes", []) for p in mesh["primitives"]}
@@ -118,28 +130,26 @@ def _scene(path: Path, tree: dict[str, Any], binary: bytes) -> Contents:
             before = len(faces)
             placed: dict[tuple[int, Any], int] = {}                # primitives may share their vertices
             for primitive in tree["meshes"][node["mesh"]]["primitives"]:
+                spend(visits=1)
                 if primitive.get("mode", 4) not in shown:
                     continue
-                primitive, own, data = decode_primitive(path, tree, binary, primitive)
                 points = primitive["attributes"]["POSITION"], primitive["attributes"].get("JOINTS_0")
-                local = accessor(own, data, points[0], "VEC3").astype(np.float64)
-                if own is not tree or points not in placed:
+                local = accessor(tree, binary, points[0], "VEC3").astype(np.float64)
+                if points not in placed:
                     placed[points] = start
                     if joints is not None and points[1] is not None:
-                        vertices.append(apply_skin(local, weights_of(own, data, primitive, len(joints)), joints))
+                        vertices.append(apply_skin(local, weights_of(tree, binary, primitive, len(joints)), joints))
                     else:
                         vertices.append(local @ instance[:3, :3].T + instance[:3, 3])
-                    colors.append(_colors(own, data, primitive, len(local)))
+                    colors.append(_colors(tree, binary, primitive, len(local)))
                     start += len(local)
-                corners = primitive_triangles(own, data, primitive, len(local)) if 0 not in shown else np.zeros((0, 3),
-                                                                                                                int)
+                corners = np.zeros((0, 3), int)
+                if 0 not in shown:
+                    corners = primitive_triangles(tree, binary, primitive, len(local))
                 # a mirroring matrix inverts triangles
                 if np.linalg.det((instance if joints is None else joints[0])[:3, :3]) < 0:
                     corners = corners[:, ::-1]
                 faces.append(polygons(path, np.full(len(corners), 3), corners.ravel(), len(local)) + placed[points])
-                most -= len(local) + 3 * len(corners) + 1
-                if most < 0:
-                    raise ValueError("it shows its meshes too often")
             if len(faces) > before:
                 objects.append((str(name), sum(map(len, faces[before:]))))
     if not vertices:
@@ -158,26 +168,8 @@ def instances_of(tree: dict[str, Any], binary: bytes, node: dict[str, Any], matr
             for key, name, kind in (("translation", "TRANSLATION", "VEC3"), ("rotation", "ROTATION", "VEC4"),
                                     ("scale", "SCALE", "VEC3")) if name in instancing["attributes"]}
     count = min(map(len, rows.values()), default=0)
+    spend(visits=count)
     return [matrix @ _matrix({key: values[i] for key, values in rows.items()}) for i in range(count)]
-
-
-def decode_primitive(path: Path, tree: dict[str, Any], binary: bytes, primitive: dict[str, Any]
-                     ) -> tuple[dict[str, Any], dict[str, Any], bytes]:
-    """Return a primitive with its tree and buffer; a Draco-compressed one is decoded into its own tree and buffer."""
-    packed = primitive.get("extensions", {}).get(_DRACO)
-    if packed is None or "bufferView" in item(tree["accessors"], primitive["attributes"]["POSITION"]):
-        return primitive, tree, binary           # not compressed, or with an uncompressed copy
-    view = item(tree["bufferViews"], packed["bufferView"])
-    start = view.get("byteOffset", 0)
-    mesh = format_draco.decode_draco(path, binary[start:start + view["byteLength"]])
-    glb = Glb()
-    glb.add_indices(np.asarray(mesh.faces))
-    attributes = {}
-    for name, identity in packed["attributes"].items():
-        values = np.asarray(mesh.get_attribute_by_unique_id(identity)["data"])
-        entry = item(tree["accessors"], primitive["attributes"][name])
-        attributes[name] = glb.add_raw(values, entry["type"], entry.get("normalized", False))
-    return {"attributes": attributes, "indices": 0}, *glb.parts()
 
 
 def joint_matrices(tree: dict[str, Any], binary: bytes, skin: dict[str, Any], places: dict[int, np.ndarray]
@@ -200,6 +192,7 @@ def weights_of(tree: dict[str, Any], binary: bytes, primitive: dict[str, Any], j
     sets = sorted(name for name in attributes if name.startswith("WEIGHTS_"))
     if not sets:
         raise ValueError("it has no weights (WEIGHTS_0): nothing says how the joints move its vertices")
+    spend(memory=16 * count * joints)
     weights = np.zeros((count, joints))
     for name in sets:
         shares = accessor(tree, binary, attributes[name], "VEC4").astype(np.float64)
@@ -284,6 +277,7 @@ def chunks_of(path: Path, data: bytes) -> tuple[dict[str, Any], bytes]:
     if not isinstance(tree, dict):
         raise MeshFileError(f"{path}: damaged GLB file, its JSON is not a table")
     with storage.taking_apart(path, "a whole GLB file", MeshFileError):
+        _check_extensions(path, tree)
         return tree, _one_buffer(path, tree, chunks.get(b"BIN\0", b""))
 
 
@@ -303,6 +297,7 @@ def nodes_of(tree: dict[str, Any]) -> Iterator[tuple[int, dict[str, Any], np.nda
         if i in seen:
             raise ValueError(f"node {i} hangs below two nodes")
         seen.add(i)
+        spend(visits=1)
         matrix = above @ _matrix(node)
         yield i, node, matrix
         open_nodes += [(child, matrix) for child in reversed(node.get("children", []))]
@@ -328,14 +323,14 @@ def accessor(tree: dict[str, Any], binary: bytes, number: int, *types: str) -> n
     kind, count = np.dtype(_COMPONENTS[entry["componentType"]]), entry["count"]
     if entry["type"] not in types:
         raise ValueError(f"accessor {number} is of type {entry['type']!r}, expected {' or '.join(types)}")
-    widths = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT4": 16}
-    width = widths[entry["type"]]
+    width = WIDTHS[entry["type"]]
+    if not isinstance(count, int) or count < 0:
+        raise ValueError(f"accessor {number}: {count!r} elements")
     if "bufferView" in entry:
         values = _values(tree, binary, f"accessor {number}", entry, kind, count, width)
-    elif isinstance(count, int) and 0 <= count * width * kind.itemsize <= 10**6 + 100 * len(binary):
-        values = np.zeros((count, width), kind)
     else:
-        raise ValueError(f"accessor {number}: {count} zeros")
+        spend(memory=8 * count * width)
+        values = np.zeros((count, width), kind)
     if "sparse" in entry:                # some values are replaced
         sparse = entry["sparse"]
         which = _values(tree, binary, f"accessor {number}", sparse["indices"],
@@ -357,6 +352,7 @@ def _values(tree: dict[str, Any], binary: bytes, what: str, entry: dict[str, Any
         raise ValueError(f"{what}: {count} elements of {size} bytes from byte {start}, one every {stride}")
     if count and start + stride * (count - 1) + size > len(binary):
         raise ValueError(f"truncated: {what} needs {start + stride * count} bytes, found {len(binary)}")
+    spend(memory=8 * count * width)
     return np.ndarray((count, width), kind, binary, start, (stride, kind.itemsize)).copy()
 
 

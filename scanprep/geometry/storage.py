@@ -18,6 +18,8 @@ from typing import IO, Any
 
 import numpy as np
 
+from .budget import memory_for
+
 HEADER = "header"
 LARGEST = 1e30                       # larger numbers count as infinite: their squares may overflow
 LARGEST_TEXT = 2**28                 # bytes: larger JSON files and tables are refused
@@ -295,9 +297,9 @@ def _arrays(path: str | Path, what: str, only: Collection[str] | None) -> dict[s
     check_regular(path, what=what)
     with taking_apart(path, what), zipfile.ZipFile(path) as archive:
         members = {info.filename[:-4]: info for info in archive.infolist() if info.filename.endswith(".npy")}
-        # refuse decompression bombs: 128 MB plus 100 times the packed size, or too many arrays
+        # refuse decompression bombs, and too many arrays
         unpacked, packed = sum(info.file_size for info in members.values()), os.path.getsize(path)
-        if unpacked > 2**27 + 100 * packed or len(members) > packed // 64:
+        if unpacked > memory_for(packed) or len(members) > packed // 64:
             raise ValueError(f"{packed} bytes that would unpack to {len(members)} arrays of {unpacked} bytes")
         found = {}
         for name, info in members.items():

@@ -1,6 +1,7 @@
 """Textures: read them with a scan, bake them onto a body, write them as GLB."""
 from __future__ import annotations
 
+import base64
 import io
 import math
 import warnings
@@ -11,10 +12,21 @@ from typing import Any, Literal
 
 import numpy as np
 
-from ..geometry.format_common import load_bytes, metres_per_unit
-from ..geometry.format_glb import Glb, chunks_of, file_beside, one_mesh, some_normal, tallest, turn_up, up_of
+from ..geometry.budget import reading, spend
+from ..geometry.format_common import MeshFileError, load_bytes, metres_per_unit
+from ..geometry.format_glb import (
+    WIDTHS,
+    Glb,
+    chunks_of,
+    file_beside,
+    one_mesh,
+    some_normal,
+    tallest,
+    turn_up,
+    up_of,
+)
 from ..geometry.mesh import Mesh
-from ..geometry.storage import write_file
+from ..geometry.storage import check_regular, taking_apart, write_file
 from ..geometry.surface import Rays, barycentric
 from .gltf import skin_material
 from .sheets import png_bytes
@@ -59,9 +71,9 @@ def bilinear(image: np.ndarray, uv: np.ndarray) -> np.ndarray:
 
 def check_pixels(size: Sequence[int]) -> None:
     """Raise ValueError for a picture of too many pixels: a small file may unpack to one that fills the memory."""
-    # largest picture that scanners write; it takes 1.6 GB of memory
-    if math.prod(size) > (8192**2):
+    if math.prod(size) > 8192**2:            # the largest picture that scanners write; it takes 1.6 GB of memory
         raise ValueError(f"{' x '.join(map(str, size))} pixels, expected at most 8192 x 8192")
+    spend(memory=8 * math.prod(size))        # a picture of 4096 x 4096 of one colour is within the budget of any mesh
 
 
 def read_texture(path: str | Path, unit: str | None = None) -> Texture | None:
@@ -96,7 +108,9 @@ def read_texture(path: str | Path, unit: str | None = None) -> Texture | None:
     # the picture is in one of two attributes, by kind of material
     pictures = (getattr(getattr(visual, "material", None), name, None) for name in ("image", "baseColorTexture"))
     image = next((image for image in pictures if image is not None), None)
-    image = None if image is None else np.asarray(image.convert("RGB"), dtype=np.float64) / 255
+    if image is not None:
+        image = np.asarray(image.convert("RGB"), dtype=np.float64)
+        image /= 255
     uv = getattr(visual, "uv", None)
     if image is None or uv is None or len(uv) != len(loaded.vertices):
         warnings.warn(f"{path}: it names a texture, but its material file or picture cannot be read; "
@@ -117,18 +131,37 @@ def read_texture(path: str | Path, unit: str | None = None) -> Texture | None:
 def load_with_materials(path: Path, function: Literal["load_mesh", "load_scene"]) -> tuple[Any, dict[str, str]]:
     """Read an OBJ or GLB with a function of trimesh; also say why pictures beside it cannot be read, by name.
 
-    ValueError where the file cannot be read.
+    MeshFileError where the file cannot be read.
     """
     import trimesh
 
-    resolver = _beside(path)
-    try:
-        with open(path, "rb") as file:
-            loaded = getattr(trimesh, function)(file, file_type=path.suffix[1:].lower(), resolver=resolver,
-                                                process=False)
-    except Exception as error:           # trimesh passes on any error of its readers
-        raise ValueError(f"{path}: expected a mesh with a texture, cannot read it ({error})") from None
+    resolver, ending = _beside(path), path.suffix[1:].lower()
+    check_regular(path, MeshFileError)
+    with reading(path, MeshFileError), taking_apart(path, "a mesh with a texture", MeshFileError):
+        data = load_bytes(path)
+        if ending == "glb":
+            _check_glb(path, data)
+        loaded = getattr(trimesh, function)(io.BytesIO(data), file_type=ending, resolver=resolver, process=False)
     return loaded, resolver.problems
+
+
+def _check_glb(path: Path, data: bytes) -> None:
+    """Spend what trimesh makes of a GLB: all its arrays and pictures, shown or not."""
+    from PIL import Image
+
+    tree, binary = chunks_of(path, data)
+    for entry in tree.get("accessors", []):
+        spend(memory=8 * entry["count"] * WIDTHS.get(entry["type"], 9))
+    for entry in tree.get("images", []):
+        if "bufferView" in entry:
+            view = tree["bufferViews"][entry["bufferView"]]
+            start = view.get("byteOffset", 0)
+            picture = binary[start:start + view["byteLength"]]
+        elif entry["uri"].startswith("data:"):
+            picture = base64.b64decode(entry["uri"].partition(",")[2])
+        else:
+            continue                     # beside the file, see `_beside`
+        check_pixels(Image.open(io.BytesIO(picture)).size)
 
 
 def _beside(path: Path) -> Any:

@@ -1,12 +1,13 @@
 """The scans of a folder, their landmark files, and the table about them."""
 from __future__ import annotations
 
+import warnings
 from dataclasses import dataclass, field
 from pathlib import Path
 
 from ..console import visible
 from ..geometry import storage, tables
-from ..geometry.files import SCAN_ENDINGS, MeshFileError, is_scan, list_files, name_of
+from ..geometry.files import SCAN_ENDINGS, MeshFileError, advice, is_scan, list_files, name_of
 from ..geometry.landmarks import landmarks_beside, names_no_landmark
 
 TABLE = "scans.csv"               # optional table beside the scans
@@ -39,6 +40,8 @@ def find_scans(folder: str | Path, landmarks: str | Path | None = None, subject:
         No scans, two of the same name, or a table about other scans.
     """
     folder = Path(folder)
+    for path in list_files(folder, lambda path: bool(advice(path))):
+        warnings.warn(f"{path}: it is left out, its format is not read here; {advice(path)}", stacklevel=2)
     paths: dict[str, Path] = {}
     for path in list_files(folder, is_scan):
         name = name_of(path)
