@@ -3,6 +3,7 @@ import csv
 import dataclasses
 import os
 import re
+import warnings
 import zipfile
 
 import numpy as np
@@ -149,6 +150,33 @@ def test_what_unpacks_to_more_than_the_memory_is_refused_by_its_name(tmp_path):
     Image.new("1", (10_000, 10_000)).save(tmp_path / "map.png")
     with pytest.raises(StorageError, match=r"map\.png.*10000 x 10000 pixels"):
         read_edited(tmp_path / "map.png", (4, 4))
+
+
+PICTURES = {"depth": read_distances, "map": lambda path: read_edited(path, (4, 4)), "page": small_picture}
+
+
+@pytest.mark.parametrize("name", PICTURES)
+@pytest.mark.parametrize("pixels", [10_000, 14_000])
+def test_pictures_of_too_many_pixels_are_refused_by_name_without_a_warning(tmp_path, name, pixels):
+    """Pillow warns of the smaller one, and refuses the larger one with an error of its own."""
+    path = tmp_path / f"{name}.png"
+    Image.new("1", (pixels, pixels)).save(path)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        with pytest.raises(StorageError, match=rf"{name}\.png.*pixels"):
+            PICTURES[name](path)
+
+
+@pytest.mark.parametrize("name", PICTURES)
+def test_a_picture_that_is_cut_short_is_refused_by_name(tmp_path, name):
+    path = tmp_path / f"{name}.png"
+    grey = np.random.default_rng(0).integers(0, 2**16, (64, 64)).astype(np.uint16)
+    Image.fromarray(grey).save(path)
+    whole = path.read_bytes()
+    for length in (0, 8, 20, 40, len(whole) // 2):
+        path.write_bytes(whole[:length])
+        with pytest.raises(StorageError, match=rf"{name}\.png"):
+            PICTURES[name](path)
 
 
 @pytest.mark.parametrize("name", ["scanprep.geometry.mesh:Mesh", "scanprep.geometry.mesh:csr_array",

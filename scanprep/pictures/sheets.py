@@ -7,7 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
-from ..geometry.storage import read_bytes, write_file
+from ..geometry.images import open_image
+from ..geometry.storage import write_file
 
 INK = (58, 62, 68)                   # colour of text: dark grey, softer than black
 
@@ -83,9 +84,7 @@ def webp_bytes(image: np.ndarray) -> bytes:
 
 def small_picture(path: Path, width: int = 700) -> bytes:
     """Read a picture from a file and encode it as WebP, no wider than `width` pixels."""
-    from PIL import Image
-
-    with Image.open(io.BytesIO(read_bytes(path, "a picture"))) as image:
+    with open_image(path, "a picture") as image:
         image.thumbnail((width, width))
         return webp_bytes(np.asarray(image.convert("RGB")))
 
