@@ -241,20 +241,24 @@ def test_the_run_ends_without_a_lock(home):
     assert sorted(p.name for p in home.iterdir()) == ["in.txt", "out", "profile"]
 
 
-STRANGE = ("=1+1", "-anna", "+49 a", "@sum", "'=1", "''-x", "[red]anna[/red]", "<b>anna</b>", "anna;b", 'an"na')
+STRANGE = ("=1+1", "-anna", "+49 a", "@sum", "'=1", "''-x", "[red]anna[/red]", "<b>anna</b>", "anna;b", 'an"na',
+           "\t=1", "\r+2", "\tanna", " =3")
 
 
 def test_a_table_gives_back_names_that_spreadsheets_would_run(tmp_path):
     write_table(tmp_path / "a.csv", ["name", "value"], [(name, -0.5) for name in STRANGE])
     assert [row["name"] for _, row in read_table(tmp_path / "a.csv", ["name", "value"])] == list(STRANGE)
-    cells = [row[0] for row in csv.reader((tmp_path / "a.csv").read_text().splitlines())][1:]
-    assert not [cell for cell in cells if cell[0] in "=+-@"]
+    with open(tmp_path / "a.csv", newline="") as file:
+        cells = [row[0] for row in csv.reader(file)][1:]
+    assert not [cell for cell in cells if cell.lstrip(" ")[0] in "=+-@\t\r"]
+    write_table(tmp_path / "b.csv", ["=name", "value"], [])
+    assert (tmp_path / "b.csv").read_text() == "'=name,value\n"
     assert all(row["value"] == "-0.5" for _, row in read_table(tmp_path / "a.csv", ["name", "value"]))
     assert number_table(["=a", "b"], np.zeros((1, 2))).startswith("'=a,b\n")
 
 
 def test_what_a_terminal_is_told_does_not_steer_it(capsys):
-    name = "\x1b[2Jan\x07na\u202e\udce9 é\u00a0ü"
+    name = "\x1b[2Jan\x07na\u202e\udce9 é\u00a0ü\nwritten: elsewhere"
     say(name)
     with bar(name) as tell:
         tell(1, 1)
@@ -262,6 +266,7 @@ def test_what_a_terminal_is_told_does_not_steer_it(capsys):
     out, err = capsys.readouterr()
     for text in (out, err):
         assert not {"\x1b", "\x07", "\u202e", "\udce9"} & set(text)
+        assert "\nwritten" not in text
     assert r"\x1b[2Jan\x07na\u202e\udce9 é" in err
     assert "[red]x[/red]" in out and "[bold]" in out
 
