@@ -10,6 +10,7 @@ from browser import take_away, wait_until
 from click_app import allowed
 from completion_bodies import MARKS, POSE, TRANS, half_view, worm_with_prior
 from config_files import config_file
+from hostile_messages import check_it_goes_on
 
 from completion.__main__ import main
 from completion.partial import report
@@ -212,3 +213,8 @@ def test_the_page_has_the_failed_first_and_then_the_worst_explained(tmp_path):
                "d": figures(80.0, "good")}
     html = FolderCall(tmp_path).description(tmp_path, "model").page(Results(results, {}, ()), [], tmp_path).html()
     assert sorted("abcd", key=lambda name: html.index(f'href="{name}/report.html"')) == ["b", "c", "d", "a"]
+
+
+def test_hostile_messages_are_refused_in_a_line(place, tmp_path, capfd):
+    shutil.copytree(place, tmp_path / "copy")
+    check_it_goes_on(mend_completions(tmp_path / "copy" / "out"), capfd)

@@ -10,6 +10,7 @@ import pytest
 from browser import wait_until
 from click_app import allowed
 from completion_bodies import worm_with_prior
+from hostile_messages import check_it_goes_on
 from mosh_folders import QuietWork, run, small_pictures, write_people
 
 from completion import MarkerLayout, MarkerSequence, read_markers, write_markers
@@ -215,3 +216,8 @@ def test_a_built_in_model_is_kept_by_its_name(tmp_path, monkeypatch):
     MoshCall((Path("walk.c3d"),), (Path("people"),), layout="cmu41").write(tmp_path)
     call = MoshCall.read(tmp_path)
     assert call.markers == (tmp_path / "walk.c3d",) and call.model == (Path("people"),) and call.layout == "cmu41"
+
+
+def test_hostile_messages_are_refused_in_a_line(place, tmp_path, capfd):
+    shutil.copytree(place, tmp_path / "copy")
+    check_it_goes_on(MoshApp(tmp_path / "copy" / "out"), capfd)

@@ -5,6 +5,7 @@ import time
 import numpy as np
 import pytest
 from browser import wait_until
+from hostile_messages import check_it_goes_on
 
 from scanprep.geometry import rotations
 from scanprep.geometry.files import write_mesh
@@ -583,3 +584,7 @@ def test_the_instruction_stands_above_the_bodies(folder, person, new_page, width
         page.locator(".sk-question button").filter(has_text="keep").click()
         wait_until(page, "program.state.question === null && document.querySelector('.sk-question').hidden")
         assert "left toe" in app.scans[0].places and not page.errors
+
+
+def test_hostile_messages_are_refused_in_a_line(folder, capfd):
+    check_it_goes_on(app_of(folder), capfd)
