@@ -80,13 +80,34 @@ def try_once(seed: Seed, name: str) -> tuple[str, str]:
     return outcome, text
 
 
+def guard() -> None:
+    """Let a huge allocation fail at once, instead of being lazy, and set the alarm."""
+    size = int((resident(False) + 6000) * 2**20)
+    with contextlib.suppress(ValueError, OSError):
+        resource.setrlimit(resource.RLIMIT_AS, (size, resource.getrlimit(resource.RLIMIT_AS)[1]))
+    signal.signal(signal.SIGPROF, _alarm)
+
+
+def measure(seed: Seed, most_seconds: float, most_megabytes: float) -> tuple[str, str, float, float]:
+    """The outcome and text of `try_once`, seconds of the processor, and megabytes; failed where they are too many."""
+    forget_peak()
+    before, start = resident(False), time.process_time()
+    signal.setitimer(signal.ITIMER_PROF, 3 * most_seconds)
+    try:
+        outcome, text = try_once(seed, seed.path.name)
+    except Slow:
+        outcome, text = "failed", "it took too long"
+    signal.setitimer(signal.ITIMER_PROF, 0)
+    seconds, megabytes = time.process_time() - start, resident(True) - before
+    if outcome != "failed" and (seconds > most_seconds or megabytes > most_megabytes):
+        outcome, text = "failed", f"{seconds:.1f} s, {megabytes:.0f} MB: {text}"
+    return outcome, text, seconds, megabytes
+
+
 def run(count: int, hours: float, first: int, only: str) -> dict[str, Any]:
     """Try `count` damaged files, or as many as fit into some hours; the figures, and what failed."""
     told: dict[str, Any] = {"read": 0, "refused": 0, "failed": 0, "longest_s": 0.0, "largest_MB": 0.0}
-    size = int((resident(False) + 6000) * 2**20)
-    with contextlib.suppress(ValueError, OSError):                   # a huge allocation fails instead of being lazy
-        resource.setrlimit(resource.RLIMIT_AS, (size, resource.getrlimit(resource.RLIMIT_AS)[1]))
-    signal.signal(signal.SIGALRM, _alarm)
+    guard()
     end = time.monotonic() + 3600 * hours
     with tempfile.TemporaryDirectory() as folder:
         seeds = [seed for seed in make_seeds(Path(folder)) if only in str(seed.path.relative_to(folder))]
@@ -98,14 +119,7 @@ def run(count: int, hours: float, first: int, only: str) -> dict[str, Any]:
             which = number % len(seeds)
             seed, data = seeds[which], mutated(good[which], seeds[which].path.name, np.random.default_rng(number))
             seed.path.write_bytes(data)
-            forget_peak()
-            before, start = resident(False), time.process_time()
-            signal.setitimer(signal.ITIMER_REAL, 30)
-            outcome, text = try_once(seed, seed.path.name)
-            signal.setitimer(signal.ITIMER_REAL, 0)
-            seconds, megabytes = time.process_time() - start, resident(True) - before
-            if outcome != "failed" and (seconds > SECONDS or megabytes > MEGABYTES):
-                outcome, text = "failed", f"{seconds:.1f} s, {megabytes:.0f} MB for {len(data)} bytes"
+            outcome, text, seconds, megabytes = measure(seed, SECONDS, MEGABYTES)
             told[outcome] += 1
             told["longest_s"] = max(told["longest_s"], round(seconds, 2))
             told["largest_MB"] = max(told["largest_MB"], round(megabytes))

@@ -23,7 +23,7 @@ def mutated(data: bytes, name: str, rng: np.random.Generator) -> bytes:
     """The bytes of a file, damaged in one way of many, or in two."""
     for _ in range(rng.integers(1, 3)):
         ways = [_bytes, _bytes, _numbers]
-        if name.endswith(".json"):
+        if name.endswith((".json", ".gltf")):
             ways += [_json, _json, _nested]
         elif name.endswith(".npz"):
             ways = [_bytes, _archive, _archive, _archive, _members]

@@ -2,6 +2,8 @@
 from __future__ import annotations
 
 import json
+import struct
+from base64 import b64encode
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,6 +12,7 @@ from typing import Any
 import numpy as np
 from conformance_bodies import KINDS
 from model_bodies import random_poses, worm, worm_skeleton
+from PIL import Image
 
 from completion import MarkerLayout, MarkerSequence, read_markers, write_markers
 from completion.mocap.animate.cli import read_betas_to
@@ -26,6 +29,7 @@ from model.learning.cli import _read_sexes
 from model.motion.bvh import read_bvh
 from model.motion.onto import read_motion
 from model.posing.cli import _read_betas, _read_turns
+from model.statue.own_mesh import read_pieces
 from scanprep import Mesh, RegisteredSet, read_landmarks, read_mesh, write_landmarks, write_mesh
 from scanprep.correspondence.correspondences import Correspondences, read_correspondences, write_correspondences
 from scanprep.decimation.registered_set import DecimateSetConfig, _load_map, write_decimated_set
@@ -164,6 +168,29 @@ def _add_meshes(body: Mesh, place: Any, add: Any, text: Any) -> None:
     text("excel.txt", "x;y;z\n0;0;1\n1;0;0.5\n0;1;0\n", read_points, good_points)
     uv = np.random.default_rng(0).random((len(body.vertices), 2))
     write_textured(path := place("a.glb"), Texture(body, uv, np.full((4, 4, 3), 0.5)))
+    add(path, lambda path: (read_mesh(path), read_texture(path)), lambda found: good_mesh(found[0]))
+    write_textured(path := place("own.glb"), Texture(body, uv, np.full((4, 4, 3), 0.5)))
+    add(path, lambda path: read_pieces(path, 1, 1.0))
+    corners = np.eye(3, dtype="<f4")
+    uri = "data:;base64," + b64encode(corners.tobytes() + np.full((3, 4), 0.25, "<f4").tobytes()).decode()
+    text("a.gltf", json.dumps({
+        "asset": {"version": "2.0"}, "scenes": [{"nodes": [0]}], "nodes": [
+            {"children": [1, 2], "scale": [1, 2, 1]}, {"mesh": 0, "rotation": [0, 0, 0, 1]}, {"mesh": 0, "skin": 0}],
+        "skins": [{"joints": [0, 1], "inverseBindMatrices": 3}], "meshes": [{"primitives": [
+            {"attributes": {"POSITION": 0, "COLOR_0": 0, "JOINTS_0": 1, "WEIGHTS_0": 2}, "mode": 5}]}],
+        "accessors": [{"bufferView": 0, "componentType": 5126, "type": "VEC3", "count": 3},
+                      {"componentType": 5121, "type": "VEC4", "count": 3},
+                      {"bufferView": 0, "byteOffset": 36, "componentType": 5126, "type": "VEC4", "count": 3},
+                      {"componentType": 5126, "type": "MAT4", "count": 2}],
+        "bufferViews": [{"buffer": 0, "byteLength": 84}], "buffers": [{"byteLength": 84, "uri": uri}]}),
+         read_mesh, good_mesh)
+    text("packed.pcd", b"FIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nPOINTS 3\nDATA binary_compressed\n"
+         + struct.pack("<II", 38, 36) + b"\x1f" + corners.tobytes()[:32] + b"\3" + corners.tobytes()[32:],
+         read_points, good_points)
+    (path := place("worn.obj")).with_name("a.mtl").write_text("newmtl A\nmap_Kd a.png\n")
+    Image.new("RGB", (8, 8), (0, 200, 0)).save(path.with_name("a.png"))
+    path.write_text("mtllib a.mtl\nv 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nvt 0 0\nvt 1 0\nvt 0 1\nusemtl A\n"
+                    "f 1/1 2/2 3/3\nf 1/1 2/2 4/3\n")
     add(path, lambda path: (read_mesh(path), read_texture(path)), lambda found: good_mesh(found[0]))
 
 

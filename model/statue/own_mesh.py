@@ -187,7 +187,8 @@ def animate_own_mesh(path: Path, stored: Path, statue: Statue, motion: Retargete
     again = "run scape statue fit with --own-mesh again"
     if not stored.is_file():
         raise StorageError(f"{stored}: the statue has no mesh of its file; {again}")
-    tree, binary = glb.read_tree(stored, load_bytes(stored))
+    with reading(stored, StorageError):
+        tree, binary = glb.read_tree(stored, load_bytes(stored))
     up = glb.up_of(tree)
     rig, arrays = own_rig(statue, names).with_up(up), glb.Glb(tree, binary)
     joints = build_nodes(rig)[1:]

@@ -19,7 +19,7 @@ FREE, PER_BYTE = 2**27, 100
 # Nodes, instances and primitives: each is at least one byte of a file, but instances may share theirs.
 VISITS = 100_000
 # Seconds of the processor, and as many for each MB: a file of small polygons takes 1 s for a MB.
-SECONDS, PER_MB = 8.0, 2.0
+SECONDS, PER_MB = 6.0, 2.0
 
 
 @dataclass

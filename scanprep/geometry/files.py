@@ -260,7 +260,10 @@ def _cloud(path: Path, contents: Contents, unit: str | None) -> PointCloud:
 
 def read_scan_mesh(path: str | Path, unit: str | None = None) -> Mesh:
     """Read a mesh as a scan: very fine scans are thinned and bad triangles repaired, both with a warning."""
-    return _sound(Path(path), read_mesh(path, unit))
+    path = Path(path)
+    storage.check_regular(path, MeshFileError)
+    with reading(path, MeshFileError):
+        return _sound(path, read_mesh(path, unit))
 
 
 def _sound(path: Path, mesh: Mesh) -> Mesh:
@@ -272,7 +275,8 @@ def read_view(path: str | Path, unit: str | None = None) -> Mesh | PointCloud:
     """Read a scan as `read_scan_mesh` does, or the points of a file without triangles, with normals and colours."""
     path = Path(path)
     contents = _read(path)
-    return _sound(path, _mesh(path, contents, unit)) if _has_faces(contents) else _cloud(path, contents, unit)
+    with reading(path, MeshFileError):
+        return _sound(path, _mesh(path, contents, unit)) if _has_faces(contents) else _cloud(path, contents, unit)
 
 
 def read_scan(path: str | Path, unit: str | None = None) -> Mesh | np.ndarray:

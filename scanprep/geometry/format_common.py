@@ -306,13 +306,16 @@ def _cuts_that_meet_nothing(sizes: np.ndarray, corners: np.ndarray, count: int) 
         ring, n = corners[start[p]:start[p] + sizes[p]], int(sizes[p])
         if len(rings[p]) < n:                # repeated corners: it meets itself anyway, and trying all corners is slow
             continue
-        fewest, way = np.inf, list[int]()
+        fewest, way, differs = float("inf"), list[int](), {int(p): False}
         for k in range(n):
             keys = _edge_key(ring[k], ring[(k + np.arange(2, n - 1)) % n], count).tolist()
             others = [q for key in keys for q in users.get(key, ())]
             spend(memory=40 * (n + len(others)))
             # duplicate polygons meet whatever the corner, so they do not count
-            met = sum(not (rings[q] <= rings[p] or rings[p] <= rings[q]) for q in others)
+            for q in set(others) - set(differs):
+                differs[q] = not (rings[q] <= rings[p] or rings[p] <= rings[q])
+                spend(memory=8 * n)
+            met = sum(map(differs.__getitem__, others))
             if met < fewest:
                 fewest, first[p], way = met, k, keys
             if not met:

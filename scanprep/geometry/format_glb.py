@@ -82,7 +82,7 @@ def _check_extensions(path: Path, tree: dict[str, Any]) -> None:
 
 def _one_buffer(path: Path, tree: dict[str, Any], binary: bytes) -> bytes:
     """Concatenate all buffers of a file, `binary` being the internal one, and move the buffer views accordingly."""
-    buffers, starts = list[bytes](), list[int]()
+    buffers, starts, end = list[bytes](), list[int](), 0
     for entry in tree.get("buffers") or [{}]:          # without a list there is only the internal one
         uri = entry.get("uri")
         if uri is None:
@@ -94,8 +94,10 @@ def _one_buffer(path: Path, tree: dict[str, Any], binary: bytes) -> bytes:
                 raise ValueError(f"a buffer inside is damaged ({problem})") from None
         else:
             data = load_bytes(file_beside(path, uri))
-        starts.append(sum(map(len, buffers)))
+        spend(memory=len(data), visits=1)            # many may be the same file, or the internal one
         buffers.append(data + b"\0" * (-len(data) % 4))
+        starts.append(end)
+        end += len(buffers[-1])
     for view in tree.get("bufferViews", []):
         view["byteOffset"] = view.get("byteOffset", 0) + item(starts, view["buffer"])
     return b"".join(buffers)

@@ -7,6 +7,7 @@ from __future__ import annotations
 import contextlib
 import re
 import warnings
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
@@ -49,7 +50,7 @@ class Element:
 
     name: str
     count: int
-    properties: tuple[Property, ...]
+    properties: Sequence[Property]
 
 
 _Column = np.ndarray | tuple[np.ndarray, np.ndarray]     # values, or the lengths and the items of lists
@@ -86,7 +87,8 @@ def _header(path: Path, data: bytes) -> tuple[str, list[Element], int, int]:
     # if all other lines end in CR alone, an LF behind this one belongs to the body
     alone = data[3:4] == b"\r" and data[4:5] != b"\n" and last_line[1] == b"\r\n"
     after = last_line.end() - alone
-    order, elements, lines = None, [], data[:last_line.start() + 1].splitlines()
+    order, elements, lines = None, list[Element](), data[:last_line.start() + 1].splitlines()
+    properties: list[Property] = []          # of the last element
     for number, line in enumerate(lines[1:], 2):
         words = line.split()
         try:
@@ -95,12 +97,13 @@ def _header(path: Path, data: bytes) -> tuple[str, list[Element], int, int]:
             if words[0] == b"format":
                 order = _ORDERS[words[1]]
             elif words[0] == b"element":
-                elements.append(Element(words[1].decode(), int(words[2]), ()))
+                elements.append(Element(words[1].decode(), int(words[2]), properties := []))
                 if elements[-1].count < 0:
                     raise ValueError
             elif words[0] == b"property":
-                last = elements[-1]
-                elements[-1] = Element(last.name, last.count, (*last.properties, _property(words)))
+                if not elements:
+                    raise IndexError
+                properties.append(_property(words))
             else:
                 raise KeyError
         except (KeyError, IndexError, ValueError):

@@ -9,6 +9,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from ..threads import search_threads
+from .budget import spend
 from .mesh import Mesh
 
 
@@ -147,9 +148,13 @@ class Rays:
         origins = check_points(origins, "origins")
         along = check_points(np.broadcast_to(directions, origins.shape), "directions").astype(np.float32)
         start = np.ascontiguousarray(origins - self._origin, dtype=np.float32)
-        hit = self._scene.run(start, along, np.full(len(start), reach, dtype=np.float32), output=True)
-        face = np.asarray(hit["primID"], dtype=np.int64)
-        return face, np.where(face >= 0, np.asarray(hit["tfar"], dtype=np.float64), np.nan)
+        face, distance = np.empty(len(start), np.int64), np.empty(len(start))
+        for first in range(0, len(start), 4096):     # where a file is read, its budget is looked at between them
+            some = slice(first, first + 4096)
+            hit = self._scene.run(start[some], along[some], np.full(len(start[some]), reach, np.float32), output=True)
+            face[some], distance[some] = hit["primID"], hit["tfar"]
+            spend()
+        return face, np.where(face >= 0, distance, np.nan)
 
     def test_occlusion(self, origins: np.ndarray, directions: np.ndarray, reach: float = 1e6) -> np.ndarray:
         """Test whether something lies within `reach` along each ray (n,)."""

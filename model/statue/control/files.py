@@ -12,6 +12,7 @@ from scipy.spatial import cKDTree
 
 from scanprep.geometry import format_glb as glb
 from scanprep.geometry import storage
+from scanprep.geometry.budget import reading
 from scanprep.geometry.format_common import MeshFileError
 from scanprep.geometry.mesh import Mesh
 from scanprep.repair.hole_filling import close
@@ -83,9 +84,9 @@ def _load(path: Path) -> ControlModel:
 
 def _read_skinned(path: Path) -> ControlModel:
     what = "a GLB file with one mesh that hangs on joints"
-    data = storage.read_bytes(path, what, MeshFileError)
-    tree, binary = glb.chunks_of(path, data)
-    with storage.taking_apart(path, what, MeshFileError):
+    storage.check_regular(path, MeshFileError, what)
+    with reading(path, MeshFileError), storage.taking_apart(path, what, MeshFileError):
+        tree, binary = glb.chunks_of(path, storage.read_bytes(path, what, MeshFileError))
         # the nodes with a mesh on joints; one skin may move several meshes, such as body and eyes
         nodes = list(glb.nodes_of(tree))
         skinned = [node for _, node, _ in nodes if "mesh" in node and "skin" in node]
@@ -113,7 +114,7 @@ def _read_skinned(path: Path) -> ControlModel:
         if not np.isfinite(points).all():
             raise ValueError(f"{(~np.isfinite(points).all(axis=1)).sum()} vertices are not finite")
         # the joint next above every joint, -1 where there is none
-        above = {child: number for number, node in enumerate(tree["nodes"]) for child in node.get("children", [])}
+        above = {child: number for number, node, _ in nodes for child in node.get("children", [])}
         parents = []
         for number in joints:
             up = above.get(number)
