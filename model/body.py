@@ -254,7 +254,11 @@ class BodyModel(ABC):
         header, arrays = storage.load(path, cls.kind, (1, 2, VERSION))
         with storage.taking_apart(path, "a whole model"):
             parts = restore_parts(header, arrays)
-            return cls.restore(parts, restore_features(parts["skeleton"], header, arrays), header, arrays)
+            model = cls.restore(parts, restore_features(parts["skeleton"], header, arrays), header, arrays)
+            # parts that do not meet have no joint, and fail only when the body is posed
+            if not np.isfinite(model.joint_regressor.data).all():
+                raise ValueError("joints: expected finite weights of the vertices around each joint")
+            return model
 
     @abstractmethod
     def arrays(self) -> dict[str, np.ndarray]:
@@ -390,8 +394,12 @@ def restore_parts(header: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -
     if len(skeleton.part_of_face) != len(template.faces):
         raise ValueError(f"part_of_face: expected one of {len(template.faces)} faces, "
                          f"found {len(skeleton.part_of_face)}")
-    # landmarks are vertex numbers of the template
+    # what commands use of the training is of its kind; landmarks are vertex numbers of the template
     info, N = header["info"], len(template.vertices)
+    for name, kinds in _INFO.items():
+        if info.get(name) is not None and not isinstance(info[name], kinds):
+            raise ValueError(f"info: expected {name} as {' or '.join(kind.__name__ for kind in kinds)}, "
+                             f"found {str(info[name])[:60]}")
     marks = info.get("landmarks") or {}
     if not all(isinstance(v, int) and 0 <= v < N for v in marks.values()):
         raise ValueError(f"info: expected landmarks on vertices 0..{N - 1}, found {str(marks)[:60]}")
@@ -402,6 +410,12 @@ def restore_parts(header: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -
             "pose_mean": storage.numbers(arrays, "pose_mean", J, 3),
             "pose_covariance": storage.numbers(arrays, "pose_covariance", 3 * J, 3 * J), "info": info,
             "pose_examples": examples}
+
+
+_INFO: dict[str, tuple[type, ...]] = {
+    "landmarks": (dict,), "sexes": (dict,), "poses": (int,), "shapes": (int,), "left_out_error": (float, int),
+    "pose_distance": (float, int), "spikes": (list,), "joint_gaps": (list,), "digests": (list,),
+    "people_vertices": (list,)}
 
 
 def _restore_attached(arrays: Mapping[str, np.ndarray], template: Mesh) -> Attached:

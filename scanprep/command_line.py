@@ -233,6 +233,11 @@ class _Call:
         arguments = self.arguments
         for argument in arguments.listed:
             argument.check_files(self.read[argument.name])
+        # what a command has made may be replaced, but not by what is made of it
+        if self.output is not None and self.output.is_file():
+            for path in _paths(self.given.get(each.name) for each in arguments.listed if each.place):
+                if path.is_file() and path.samefile(self.output):
+                    raise UsageError(f"--output: expected another file than {path}, which is read")
         # Judgements of earlier results carry over. Read them before anything is written, as the output may be an input.
         # Positional arguments are what the command works on; flags name what it merely uses.
         before = carry_judgements(_paths(self.given.get(each.name) for each in arguments.listed if each.place),

@@ -9,10 +9,11 @@ import os
 import platform
 import sys
 import time
-import unicodedata
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
+
+from .words import printable
 
 if TYPE_CHECKING:               # imported where used, so that help answers at once
     from .batch.workspace import Workspace
@@ -88,7 +89,7 @@ def bar(what: str) -> Iterator[Progress]:
     from rich.console import Console
 
     if not Console(stderr=True).is_terminal:
-        with _progress_lines(visible(what)) as report_progress:
+        with _progress_lines(printable(what)) as report_progress:
             yield report_progress
         return
     with contextlib.ExitStack() as stack:
@@ -99,7 +100,7 @@ def bar(what: str) -> Iterator[Progress]:
             _open_displays.append(stack.enter_context(progress.Progress(*columns, console=Console(stderr=True))))
             stack.callback(_open_displays.pop)
         shown = _open_displays[-1]
-        task = shown.add_task(visible(what), total=None, start=False, visible=False)
+        task = shown.add_task(printable(what), total=None, start=False, visible=False)
 
         def report_progress(done: int, total: int) -> None:
             shown.start_task(task)
@@ -132,16 +133,6 @@ def _progress_lines(what: str) -> Iterator[Progress]:
 _open_displays: list[Any] = []       # the display that bars share, while one is open
 
 
-def visible(text: str) -> str:
-    """Make text fit for a terminal: control characters, as in file names, are written as `\\x1b`.
-
-    Line breaks stay.
-    """
-    # Unicode categories without a visible form: control, format (also writing direction), surrogates, separators
-    return "".join(c if c == "\n" or unicodedata.category(c) not in {"Cc", "Cf", "Cs", "Zl", "Zp"} else
-                   c.encode("unicode_escape", "surrogatepass").decode("ascii") for c in text)
-
-
 def split_figures(metrics: Iterable[Metric]) -> tuple[list[Metric], list[Metric]]:
     """Split rows into those of the closing table, at most twelve, as many as one reads at a glance, and the rest."""
     metrics = list(metrics)
@@ -151,7 +142,7 @@ def split_figures(metrics: Iterable[Metric]) -> tuple[list[Metric], list[Metric]
 
 def say(text: str) -> None:
     """Print a line on standard error."""
-    sys.stderr.write(visible(text) + "\n")
+    sys.stderr.write(printable(text) + "\n")
 
 
 def show(metrics: list[Metric]) -> None:
@@ -164,7 +155,7 @@ def show(metrics: list[Metric]) -> None:
     table.columns[1].justify = "right"
     main, more = split_figures(metrics)
     for metric in main:          # as plain text: rich would read [brackets] in names as markup
-        table.add_row(*(Text(visible(cell)) for cell in (metric.name, metric.text(), metric.unit)))
+        table.add_row(*(Text(printable(cell)) for cell in (metric.name, metric.text(), metric.unit)))
     if more:
         table.caption = f"{len(more)} more in report.json"
     Console().print(table)

@@ -1,6 +1,7 @@
 """Texts of messages for users: numbers with nouns, and the modules whose warnings are shown."""
 from __future__ import annotations
 
+import unicodedata
 from dataclasses import fields
 from typing import Any
 
@@ -16,6 +17,19 @@ def number_of(count: int, one: str, several: str = "") -> str:
     ('1 flap', '1,200 flaps', '3 people')
     """
     return f"{count:,} {one if count == 1 else several or one + 's'}"
+
+
+def printable(text: str) -> str:
+    """Write what has no visible form, as control characters and line ends in names, as `\\x1b`.
+
+    Examples
+    --------
+    >>> print(printable("left knee\\n"))
+    left knee\\n
+    """
+    # Unicode categories: control, format (also writing direction), surrogates, separators
+    return "".join(c.encode("unicode_escape", "surrogatepass").decode("ascii")
+                   if unicodedata.category(c) in {"Cc", "Cf", "Cs", "Zl", "Zp"} else c for c in text)
 
 
 def describe_result(result: Any) -> str:

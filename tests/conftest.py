@@ -19,6 +19,7 @@ if "PYTEST_XDIST_WORKER" in os.environ:                      # processes do not 
 
 from browser import browser, new_page, page  # noqa: F401 -- fixtures
 from click_app import app, server  # noqa: F401 -- fixtures
+from exclusive_writes import ExclusiveWrites
 
 from scanprep.command_line import run
 
@@ -48,6 +49,19 @@ def pytest_collection_modifyitems(items):
     `readme_model` and `demo` wait for the folder that `readme` makes first, so they are not at the very beginning.
     """
     items.sort(key=lambda item: PLACE.get(item.path.name, len(PLACE)))
+
+
+@pytest.fixture(scope="session")
+def listener():
+    return ExclusiveWrites()
+
+
+@pytest.fixture(autouse=True)
+def exclusive_writes(listener):
+    """Every file that scapekit writes in a test is one that it made itself, never one that was there, or a link."""
+    listener.wrong.clear()
+    yield listener
+    assert not listener.wrong
 
 
 @pytest.fixture(scope="session", autouse=True)

@@ -7,7 +7,8 @@ from glb_reader import Glb
 
 from completion.partial.colors import ColorConfig, blend, carry_colors, views_with_colors
 from scanprep.geometry.files import PointCloud
-from scanprep.geometry.format_glb import tallest, turn_up
+from scanprep.geometry.format_glb import Glb as GlbFile
+from scanprep.geometry.format_glb import one_mesh, tallest, turn_up
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.surface import Surface
 from scanprep.pictures.textures import Texture, bake_body_texture, read_texture, write_textured
@@ -151,6 +152,34 @@ def test_a_file_without_a_texture_has_none(tmp_path):
     with pytest.warns(UserWarning, match="its colours are left out"), warnings.catch_warnings():
         warnings.filterwarnings("ignore", module="trimesh")
         assert read_texture(write_obj(tmp_path, "missing.png")) is None
+
+
+@pytest.mark.parametrize("corner", ["nan", "inf", "1e40"])
+def test_a_mesh_that_cannot_carry_its_texture_is_refused_by_name(tmp_path, corner):
+    path = write_obj(tmp_path)
+    path.write_text(path.read_text().replace("v 0.0 0.0 0", f"v {corner} 0 0"))
+    with pytest.raises(ValueError, match=r"a\.obj"):
+        read_texture(path)
+
+
+def test_a_picture_in_a_glb_that_is_damaged_or_huge_is_refused_by_name(tmp_path):
+    from PIL import Image
+
+    path = tmp_path / "square.glb"
+    write_textured(path, Texture(SQUARE, UV, np.random.default_rng(0).random((64, 64, 3))))
+    whole = path.read_bytes()
+    place = whole.index(b"IDAT")
+    path.write_bytes(whole[:place + 2000] + bytes(100) + whole[place + 2100:])
+    with pytest.raises(ValueError, match=r"square\.glb"):
+        read_texture(path)
+    Image.new("1", (8200, 8200)).save(tmp_path / "huge.png")
+    glb = GlbFile()
+    surface = glb.add_surface(SQUARE, SQUARE.vertex_normals, UV)
+    image = glb.add_png((tmp_path / "huge.png").read_bytes(), "texture")
+    document = one_mesh({"primitives": [surface]}, {"pbrMetallicRoughness": {"baseColorTexture": {"index": 0}}}, {})
+    path.write_bytes(glb.pack({**document, "images": [image], "textures": [{"source": 0}]}, 2))
+    with pytest.raises(ValueError, match=r"square\.glb.*8200 x 8200 pixels"):
+        read_texture(path)
 
 
 def test_a_baked_texture_shows_the_colours_of_the_scan(person, views):

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from browser import wait_until
 from completion_bodies import MARKS, POSE, QUICK, TRANS, half_view, worm_with_prior
+from hostile_messages import check_it_goes_on
 from test_completion_partial import errors
 
 from completion.partial.clicked_landmarks import landmark_doubts
@@ -216,3 +217,7 @@ def test_from_a_half_view_to_a_saved_body_by_mouse_alone(case, new_page, tmp_pat
     assert len(clicked) == 4
     for name, place in clicked.items():
         assert np.linalg.norm(place - body.vertices[MARKS[NAMES.index(name)]]) < 0.03
+
+
+def test_hostile_messages_are_refused_in_a_line(case, capfd):
+    check_it_goes_on(case[-1], capfd)

@@ -57,6 +57,21 @@ def test_a_layout_is_shown_on_a_model(tmp_path):
     assert len(read_marker_set(file, file.read_bytes())) == 67
 
 
+STRANGE_LABELS = ("two\nlines", "bell\x07", "a$b$\\frac{", "=1+1", "-x", " ", "<b>", "\u202eback", "'")
+
+
+def test_labels_that_no_line_can_hold_are_shown(tmp_path, person):
+    write_mesh(tmp_path / "body.ply", person.mesh)
+    layout = load_layout("vicon47", person.mesh)
+    names = dict(zip(layout.labels, STRANGE_LABELS, strict=False))
+    layout = MarkerLayout(tuple(names.get(label, label) for label in layout.labels), layout.vertices, layout.distances)
+    layout.save(tmp_path / "mine.json")
+    assert main(["layout", "show", str(tmp_path / "mine.json"), "--body", str(tmp_path / "body.ply"),
+                 "-o", str(tmp_path / "out")]) == 0
+    assert MarkerLayout.load(tmp_path / "out" / "layout.json", 12500).labels == layout.labels
+    assert "&lt;b&gt;" in (tmp_path / "out" / "report.html").read_text()
+
+
 # places in the marker set of OpenSim's model gait2392, metres, of markers that sit on the same bones
 GAIT2392 = {"RFWT": ("pelvis", (0.02, 0.03, 0.128)), "LFWT": ("pelvis", (0.02, 0.03, -0.128)),
             "RKNE": ("femur_r", (0.0, -0.404, 0.05)), "RANK": ("tibia_r", (-0.005, -0.41, 0.053)),

@@ -7,8 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from browser import take_away, wait_until
+from click_app import allowed
 from completion_bodies import MARKS, POSE, TRANS, half_view, worm_with_prior
 from config_files import config_file
+from hostile_messages import check_it_goes_on
 
 from completion.__main__ import main
 from completion.partial import report
@@ -91,7 +93,7 @@ def finished(app):
 
 
 def test_results_are_opened_worst_first_with_what_is_stored(place):
-    app = mend_completions(place / "out")
+    app = allowed(mend_completions(place / "out"))
     state = told(app)
     assert [one["name"] for one in state["scans"]] == ["c.ply", "b.ply", "a.ply", "d.ply"]
     verdicts = [one["verdict"] for one in state["verdicts"]]
@@ -116,7 +118,7 @@ def test_results_are_opened_worst_first_with_what_is_stored(place):
 
 
 def test_another_model_or_setting_makes_results_outdated(place):
-    app = mend_completions(place / "out")
+    app = allowed(mend_completions(place / "out"))
     other = CompletionsApp(replace(app.call, config=replace(app.call.config, rounds=4)), place / "out")
     for one, outdated in ((app, False), (other, True)):
         opened(one, "a")
@@ -128,7 +130,7 @@ def test_another_model_or_setting_makes_results_outdated(place):
 def test_a_folder_is_mended_in_the_browser_and_the_command_keeps_it(place, new_page):
     """The exchanged landmarks are taken away by key, the body, which had failed, completed again, and saved."""
     untouched = (place / "out" / "a" / "completed.ply").stat().st_mtime_ns
-    app = mend_completions(place / "out")
+    app = allowed(mend_completions(place / "out"))
     with Server(app) as served:
         page = new_page(viewport={"width": 1300, "height": 800})
         page.goto(served.opening())
@@ -211,3 +213,8 @@ def test_the_page_has_the_failed_first_and_then_the_worst_explained(tmp_path):
                "d": figures(80.0, "good")}
     html = FolderCall(tmp_path).description(tmp_path, "model").page(Results(results, {}, ()), [], tmp_path).html()
     assert sorted("abcd", key=lambda name: html.index(f'href="{name}/report.html"')) == ["b", "c", "d", "a"]
+
+
+def test_hostile_messages_are_refused_in_a_line(place, tmp_path, capfd):
+    shutil.copytree(place, tmp_path / "copy")
+    check_it_goes_on(mend_completions(tmp_path / "copy" / "out"), capfd)

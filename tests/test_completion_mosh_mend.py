@@ -8,7 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 from browser import wait_until
+from click_app import allowed
 from completion_bodies import worm_with_prior
+from hostile_messages import check_it_goes_on
 from mosh_folders import QuietWork, run, small_pictures, write_people
 
 from completion import MarkerLayout, MarkerSequence, read_markers, write_markers
@@ -93,7 +95,7 @@ def test_files_of_corrections_are_numbered(tmp_path, monkeypatch):
 
 
 def test_corrections_are_saved_beside_and_undone(place):
-    app, given = MoshApp(place / "out"), (place / "layout.json").read_bytes()
+    app, given = allowed(MoshApp(place / "out")), (place / "layout.json").read_bytes()
     state, file = told(app), place / "out" / "corrected_layout_1.json"
     assert state["scans"] == [{"name": "walk", "count": 34}] and not state["changed"]
     assert set(app.names[:3]) == {MOVED, *EXCHANGED} and state["verdicts"][0]["verdict"] == "failed"     # worst first
@@ -110,7 +112,7 @@ def test_corrections_are_saved_beside_and_undone(place):
     assert set(usual.labels) - set(saved.labels) == {"M5"}
     assert saved.nearest[saved.labels.index("M2")] == usual.vertices[usual.labels.index("M20")]
     assert set(changes(usual, saved)) == {MOVED, *EXCHANGED, "M5"} == set(told(app)["changed"])
-    again = MoshApp(place / "out")                                                     # another session
+    again = allowed(MoshApp(place / "out"))                                                     # another session
     assert set(told(again)["changed"]) == set(told(app)["changed"]) and "M5" not in again.scan.places
     for label, spot in again.scan.places.items():
         np.testing.assert_allclose(spot, app.scan.places[label], atol=1e-9)
@@ -125,7 +127,7 @@ def test_corrections_are_saved_beside_and_undone(place):
 
 def test_a_correction_is_of_the_layout_and_so_of_all_people(place, tmp_path):
     assert run(place, place / "people", "-o", tmp_path / "out", repair=False, soft_tissue=False) in (0, 1)
-    app = MoshApp(tmp_path / "out")
+    app = allowed(MoshApp(tmp_path / "out"))
     assert {one["name"] for one in told(app)["scans"]} == {"ann", "bob"}
     assert len({frame.split(",")[0] for frame in told(app)["frames"]}) == (2 if app.person.name == "ann" else 1)
     first, found = app.person, [dict(scan.places) for scan in app.scans]
@@ -142,7 +144,7 @@ def test_a_correction_is_of_the_layout_and_so_of_all_people(place, tmp_path):
 
 
 def test_another_run_at_work_is_told_and_corrections_stay(place):
-    app = MoshApp(place / "out")
+    app = allowed(MoshApp(place / "out"))
     sent(app, "remove", pane=1, name="M5")
     with lock_output(place / "out" / HOME / "lock", place / "out"):
         sent(app, "run")
@@ -172,7 +174,7 @@ def test_a_result_that_was_moved_or_made_earlier_is_told(place, tmp_path):
 @pytest.mark.slow
 def test_a_result_is_mended_in_the_browser_and_run_again(place, new_page):
     """Two labels are exchanged by the mouse, a marker moved; the button runs again, and all markers are believed."""
-    app = MoshApp(place / "out")
+    app = allowed(MoshApp(place / "out"))
     with Server(app) as server:
         page = new_page(viewport={"width": 1300, "height": 800})
         page.goto(server.opening())
@@ -214,3 +216,8 @@ def test_a_built_in_model_is_kept_by_its_name(tmp_path, monkeypatch):
     MoshCall((Path("walk.c3d"),), (Path("people"),), layout="cmu41").write(tmp_path)
     call = MoshCall.read(tmp_path)
     assert call.markers == (tmp_path / "walk.c3d",) and call.model == (Path("people"),) and call.layout == "cmu41"
+
+
+def test_hostile_messages_are_refused_in_a_line(place, tmp_path, capfd):
+    shutil.copytree(place, tmp_path / "copy")
+    check_it_goes_on(MoshApp(tmp_path / "copy" / "out"), capfd)

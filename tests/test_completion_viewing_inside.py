@@ -6,7 +6,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from browser import wait_until, watched
+from click_app import allowed
 from completion_bodies import MARKS, POSE, QUICK, TRANS, half_view, worm_with_prior
+from hostile_messages import check_it_goes_on
 from PIL import Image
 from test_completion_depth_picture import AWAY, taken
 from test_completion_interactive import NAMES, clicked_on_the_scan, finished
@@ -89,6 +91,10 @@ def drop_in(page, *paths):
 
 
 # in Python
+
+
+def test_hostile_messages_are_refused_in_a_line(files, tmp_path, capfd):
+    check_it_goes_on(Pages(app_of(files, "half.ply", "worm.npz", output=tmp_path / "out")), capfd)
 
 
 def test_dropped_files_join_the_things_and_take_each_others_place(app, files, tmp_path):
@@ -181,7 +187,7 @@ def test_a_set_is_mended_from_the_view(place):  # noqa: F811
     before = app.contents[app.shown[0]]
     page = entered(app, what="mend", folder=one[0]["folder"])
     assert page.name == "mend" and page.scans[0].file.name == "body1" + ENDING
-    mend(page, place)
+    mend(allowed(page), place)
     page.handle(Message("register", {}), lambda message: None)
     wait_for(page)
     app.on_return(page)

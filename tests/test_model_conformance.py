@@ -1,9 +1,11 @@
 """What every kind of body model must do, whatever it is made of; the kinds are listed in `conformance_bodies`."""
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import toy_kind
 from completion_bodies import half_view
-from conformance_bodies import KINDS, stiff_bodies
+from conformance_bodies import KINDS, scape_worm, stiff_bodies
 from derivatives import differences
 from model_bodies import random_poses
 
@@ -18,7 +20,7 @@ from model.cli import group
 from model.files import load_model
 from model.fitting.vertices import FitConfig, fit_pose, fit_shape
 from model.resolution.change import resolution_gap
-from scanprep.geometry import rotations
+from scanprep.geometry import rotations, storage
 from scanprep.geometry.surface import Surface
 
 BETAS = np.array([0.7, -1.2, 0.4])
@@ -209,6 +211,31 @@ def test_a_damaged_file_is_refused(model, tmp_path):
             np.savez(tmp_path / "lacks.npz", **{k: v for k, v in arrays.items() if k != name})
             with pytest.raises(ValueError, match=r"lacks\.npz.*"):
                 load_model(tmp_path / "lacks.npz")
+
+
+def test_a_damaged_file_is_refused_or_the_body_can_be_posed(model, tmp_path, rng):
+    model.save(tmp_path / "worm.npz")
+    arrays, path = storage.load_arrays(tmp_path / "worm.npz"), tmp_path / "damaged.npz"
+    for name in sorted(arrays.keys() - {"header"}):
+        whole = arrays[name]
+        for damaged in (np.zeros_like(whole), -whole, rng.permutation(whole.ravel()).reshape(whole.shape)):
+            np.savez(path, **{**arrays, name: damaged})
+            try:
+                found = load_model(path)
+            except storage.StorageError as error:
+                assert "damaged.npz" in str(error)
+                continue
+            pose = random_poses(found, 1, rng, 0.3)[0]
+            assert np.isfinite([*found.vertices(pose, BETAS), *found.rest_joints(BETAS)]).all()
+
+
+@pytest.mark.parametrize(("name", "value"), [("landmarks", [1]), ("sexes", 3), ("poses", "many"), ("digests", 1.5),
+                                             ("left_out_error", "small"), ("joint_gaps", {"a": 1})])
+def test_a_file_with_other_notes_of_its_training_is_refused(tmp_path, name, value):
+    model = scape_worm()
+    replace(model, info={**model.info, name: value}).save(tmp_path / "worm.npz")
+    with pytest.raises(storage.StorageError, match=rf"worm\.npz.*{name}"):
+        load_model(tmp_path / "worm.npz")
 
 
 def test_known_poses_are_recovered(model, rng):

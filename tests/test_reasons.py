@@ -41,6 +41,7 @@ SAID_BY = {
     "completion/tracking/folder.py _by_folder": "track",
     "completion/tracking/folder.py _by_pattern": "track",
     "completion/tracking/sequence.py tracking_problem": "track",
+    "model/learning/scape.py judge_model": "learn",
     "model/coregistration/lead.py model_lead": "prep register, prep run",
     "model/statue/verdict.py judge_statue": "statue fit",
     "model/statue/motion/motions.py read_statue_motion": "statue animate",

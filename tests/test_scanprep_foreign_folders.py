@@ -3,6 +3,7 @@ import csv
 import dataclasses
 import os
 import re
+import warnings
 import zipfile
 
 import numpy as np
@@ -151,6 +152,33 @@ def test_what_unpacks_to_more_than_the_memory_is_refused_by_its_name(tmp_path):
         read_edited(tmp_path / "map.png", (4, 4))
 
 
+PICTURES = {"depth": read_distances, "map": lambda path: read_edited(path, (4, 4)), "page": small_picture}
+
+
+@pytest.mark.parametrize("name", PICTURES)
+@pytest.mark.parametrize("pixels", [10_000, 14_000])
+def test_pictures_of_too_many_pixels_are_refused_by_name_without_a_warning(tmp_path, name, pixels):
+    """Pillow warns of the smaller one, and refuses the larger one with an error of its own."""
+    path = tmp_path / f"{name}.png"
+    Image.new("1", (pixels, pixels)).save(path)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        with pytest.raises(StorageError, match=rf"{name}\.png.*pixels"):
+            PICTURES[name](path)
+
+
+@pytest.mark.parametrize("name", PICTURES)
+def test_a_picture_that_is_cut_short_is_refused_by_name(tmp_path, name):
+    path = tmp_path / f"{name}.png"
+    grey = np.random.default_rng(0).integers(0, 2**16, (64, 64)).astype(np.uint16)
+    Image.fromarray(grey).save(path)
+    whole = path.read_bytes()
+    for length in (0, 8, 20, 40, len(whole) // 2):
+        path.write_bytes(whole[:length])
+        with pytest.raises(StorageError, match=rf"{name}\.png"):
+            PICTURES[name](path)
+
+
 @pytest.mark.parametrize("name", ["scanprep.geometry.mesh:Mesh", "scanprep.geometry.mesh:csr_array",
                                   "scanprep.pictures.scene:_Columns", "os:stat_result", "scanprep.cli:Path"])
 def test_a_record_names_another_class_than_is_kept(tmp_path, name):
@@ -213,20 +241,24 @@ def test_the_run_ends_without_a_lock(home):
     assert sorted(p.name for p in home.iterdir()) == ["in.txt", "out", "profile"]
 
 
-STRANGE = ("=1+1", "-anna", "+49 a", "@sum", "'=1", "''-x", "[red]anna[/red]", "<b>anna</b>", "anna;b", 'an"na')
+STRANGE = ("=1+1", "-anna", "+49 a", "@sum", "'=1", "''-x", "[red]anna[/red]", "<b>anna</b>", "anna;b", 'an"na',
+           "\t=1", "\r+2", "\tanna", " =3")
 
 
 def test_a_table_gives_back_names_that_spreadsheets_would_run(tmp_path):
     write_table(tmp_path / "a.csv", ["name", "value"], [(name, -0.5) for name in STRANGE])
     assert [row["name"] for _, row in read_table(tmp_path / "a.csv", ["name", "value"])] == list(STRANGE)
-    cells = [row[0] for row in csv.reader((tmp_path / "a.csv").read_text().splitlines())][1:]
-    assert not [cell for cell in cells if cell[0] in "=+-@"]
+    with open(tmp_path / "a.csv", newline="") as file:
+        cells = [row[0] for row in csv.reader(file)][1:]
+    assert not [cell for cell in cells if cell.lstrip(" ")[0] in "=+-@\t\r"]
+    write_table(tmp_path / "b.csv", ["=name", "value"], [])
+    assert (tmp_path / "b.csv").read_text() == "'=name,value\n"
     assert all(row["value"] == "-0.5" for _, row in read_table(tmp_path / "a.csv", ["name", "value"]))
     assert number_table(["=a", "b"], np.zeros((1, 2))).startswith("'=a,b\n")
 
 
 def test_what_a_terminal_is_told_does_not_steer_it(capsys):
-    name = "\x1b[2Jan\x07na\u202e\udce9 é\u00a0ü"
+    name = "\x1b[2Jan\x07na\u202e\udce9 é\u00a0ü\nwritten: elsewhere"
     say(name)
     with bar(name) as tell:
         tell(1, 1)
@@ -234,6 +266,7 @@ def test_what_a_terminal_is_told_does_not_steer_it(capsys):
     out, err = capsys.readouterr()
     for text in (out, err):
         assert not {"\x1b", "\x07", "\u202e", "\udce9"} & set(text)
+        assert "\nwritten" not in text
     assert r"\x1b[2Jan\x07na\u202e\udce9 é" in err
     assert "[red]x[/red]" in out and "[bold]" in out
 

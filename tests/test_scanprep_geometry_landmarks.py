@@ -1,5 +1,7 @@
 """Landmark files of every kind, and what is said when they are wrong."""
+import csv
 import json
+import re
 
 import numpy as np
 import pytest
@@ -150,6 +152,19 @@ def test_every_format_comes_back(tmp_path, ending):
     np.testing.assert_allclose(read_landmarks(tmp_path / f"mm{ending}", unit="mm")["nose"], points["nose"], atol=1e-9)
     write_landmarks(tmp_path / f"again{ending}", found)
     assert (tmp_path / f"again{ending}").read_bytes() == (tmp_path / f"a{ending}").read_bytes() or ending == ".lnd"
+
+
+@pytest.mark.parametrize("ending", WRITTEN)
+def test_a_name_like_a_formula_comes_back_and_no_spreadsheet_runs_it(tmp_path, ending):
+    names = ("=1+1", "+x", "-knee", "@SUM(1)", "'=x", "''-x", "'x", "=HYPERLINK(\"http://a\",\"b\")")
+    if ending in (".lnd", ".txt"):                               # without columns; a name has no "=" there
+        names = tuple(name for name in names if "=" not in name)
+    write_landmarks(tmp_path / f"a{ending}", {name: np.array([-1.0, 2, 3]) for name in names})
+    assert [*read_landmarks(tmp_path / f"a{ending}")] == [*names]
+    if ending in (".csv", ".fcsv"):
+        with open(tmp_path / f"a{ending}", encoding="utf-8", newline="") as file:
+            cells = [cell for row in csv.reader(file) for cell in row if not cell.startswith("#")]
+        assert not [cell for cell in cells if re.match(r"[=+@\t\r]|-\D", cell)]
 
 
 @pytest.mark.parametrize("ending", WRITTEN)

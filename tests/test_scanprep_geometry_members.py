@@ -9,8 +9,9 @@ from model import LearnConfig, learn_blendscape, learn_scape, learn_skinning
 from model.learning.mixing import learn_scape_mix
 from model.learning.scape import judge_model
 from scanprep import RegisteredSet, find_skeleton, write_mesh
+from scanprep.geometry import rotations
 from scanprep.geometry.files import MeshFileError, read_registered
-from scanprep.geometry.members import ONE_BODY, ONE_KIND, check_members, find_spikes
+from scanprep.geometry.members import ONE_BODY, ONE_KIND, check_members, find_doubtful_members
 from scanprep.geometry.mesh import Mesh
 
 QUICK = LearnConfig(refinements=0, components=2, prunings=(0.01,), ridges=(0.01,))
@@ -82,27 +83,55 @@ def test_a_mirror_image_is_found_under_noise_as_long_as_an_edge(truth, poses):
 @pytest.mark.parametrize("size", [0.01, 1.0, 1000.0])
 def test_a_spike_is_named_whatever_the_size(truth, poses, size):
     bodies, template = size * poses, Mesh(size * truth.template.vertices, truth.template.faces)
-    assert find_spikes(template, bodies, "poses") == []
+    assert find_doubtful_members(template, bodies, "poses", ratio=ONE_BODY) == []
     bodies[5] = spiked(bodies[5])
     check_members(template, bodies, "poses", ratio=ONE_BODY)
-    (doubt,) = find_spikes(template, bodies, "poses")
+    (doubt,) = find_doubtful_members(template, bodies, "poses", ratio=ONE_BODY)
     assert doubt.startswith("poses[5]: vertex 100 is a spike")
+
+
+def test_poses_of_half_the_size_of_the_template_need_a_look(truth, poses):
+    (doubt,) = find_doubtful_members(truth.template, poses / 2, "poses", ratio=ONE_BODY)
+    assert "poses: the bodies are 0.5 times as large as the template" in doubt
+    assert find_doubtful_members(truth.template, poses, "poses", ratio=ONE_BODY) == []
+
+
+def test_poses_of_different_people_need_a_look(truth, poses):
+    sizes = np.exp(np.linspace(-0.06, 0.06, 8))[:, None, None]
+    (doubt,) = find_doubtful_members(truth.template, sizes * poses, "poses", ratio=ONE_BODY)
+    assert "different people" in doubt
+    assert find_doubtful_members(truth.template, sizes * poses, "shapes") == []
+
+
+def test_one_body_as_many_people_needs_a_look(truth, poses):
+    (doubt,) = find_doubtful_members(truth.template, poses, "shapes")
+    assert "one body in many poses" in doubt
+    # the same in one pose, turned, scaled and with noise: copies are named
+    many = poses * np.exp(np.linspace(-0.06, 0.06, 8))[:, None, None]
+    turn, noise = rotations.exp(np.array([0.3, 2.0, 1.0])), np.random.default_rng(3).normal(0, 1, many[0].shape)
+    many[5] = 1.1 * many[2] @ turn.T + 2 + 0.0005 * np.ptp(many[2]) * noise
+    assert find_doubtful_members(truth.template, many, "shapes", list("abcdefgh")) == [
+        "shapes: c: f is the same body in the same pose: leave out the copies"]
+    assert find_doubtful_members(truth.template, many, "poses", ratio=np.inf) == []
+    many[5] = 1.1 * many[2] @ turn.T + 2
+    (doubt,) = find_doubtful_members(truth.template, many, "poses", ratio=np.inf)
+    assert doubt.startswith("poses[2]: [5] is the same body")
 
 
 def test_bending_fingers_are_poses_of_one_hand():
     mesh, rng = hand(), np.random.default_rng(1)
     fists = np.stack([bend_fingers(mesh, rng.uniform(-0.3, 1.4, 4)) for _ in range(8)])
     check_members(mesh, fists, "poses", ratio=ONE_BODY)
-    assert find_spikes(mesh, fists, "poses") == []
+    assert find_doubtful_members(mesh, fists, "poses", ratio=ONE_BODY) == []
 
 
 @pytest.mark.real
 def test_scans_of_people_are_poses_of_one_and_bodies_of_one_kind(real_data):
     for folder, ratio in (("scape_poses", ONE_BODY), ("spring_shapes", ONE_KIND)):
-        faces, bodies, names = read_registered(real_data / folder)
-        template = Mesh(bodies[0], faces)
+        read = read_registered(real_data / folder)
+        template, bodies, names = Mesh(read.vertices[0], read.faces), read.vertices, read.names
         check_members(template, bodies, folder, names, ratio)
-        assert find_spikes(template, bodies, folder, names) == []
+        assert find_doubtful_members(template, bodies, folder, names, ratio) == []
 
 
 def test_every_way_to_learn_refuses_a_mirrored_pose(truth, poses):
@@ -123,9 +152,10 @@ def test_every_way_to_learn_refuses_a_mirrored_pose(truth, poses):
 def test_a_model_of_a_spiked_pose_needs_a_look(truth, poses):
     bodies = poses.copy()
     bodies[5] = spiked(bodies[5])
-    model = learn_scape(truth.template, bodies, poses, truth.skeleton, QUICK)
+    people = poses * np.exp(np.linspace(-0.06, 0.06, 8))[:, None, None]
+    model = learn_scape(truth.template, bodies, people, truth.skeleton, QUICK)
     assert any("poses[5]: vertex 100 is a spike" in reason for reason in judge_model(model).doubts)
-    assert judge_model(learn_scape(truth.template, poses, poses, truth.skeleton, QUICK)).verdict == "good"
+    assert judge_model(learn_scape(truth.template, poses, people, truth.skeleton, QUICK)).verdict == "good"
 
 
 def test_a_body_without_rigid_parts_needs_a_look(truth):

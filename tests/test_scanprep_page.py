@@ -180,10 +180,17 @@ def test_scans_from_one_side_are_not_blamed_for_it():
     assert judge_whole(review([replace(f, seen=0.8) for f in front], {}, 1.4, 25_000), None).verdict == "good"
 
 
-def test_another_number_of_parts_than_wanted_needs_a_look():
+@pytest.mark.parametrize(("sizes", "said"), [(np.linspace(0.99, 1.01, 8), None),
+                                             (np.linspace(0.93, 1.07, 8), "different people")])
+def test_a_set_is_doubted_for_its_skeleton_and_first_for_several_people_in_it(template, tmp_path, sizes, said):
     verdicts, tree = review([GOOD], {}, 1.4, 25_000), Skeleton([0, 1], [-1, 0], np.zeros((2, 3)))
-    assert judge_whole(verdicts, tree, parts=2).verdict == "good"
-    assert "no skeleton of 16 parts was found, the nearest has 2" in judge_whole(verdicts, tree, parts=16).why
+    whole = replace(RegisteredSet.create(tmp_path / "set", template), skeleton=tree)
+    for number, size in enumerate(sizes):
+        whole = whole.add(f"pose{number}", size * template.vertices, subject="anna")
+    assert (judge_whole(verdicts, whole, parts=2).verdict == "good") == (said is None)
+    reasons = judge_whole(verdicts, whole, parts=16).reasons
+    assert "no skeleton of 16 parts was found, the nearest has 2" in reasons[-1]
+    assert said is None or said in reasons[0]
 
 
 def test_stretches_of_a_known_map(template):

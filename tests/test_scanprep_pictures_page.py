@@ -86,6 +86,17 @@ def test_a_long_path_may_break_at_its_folders():
     assert "<td>/scans/<wbr>anna.ply</td>" in Page("x").table([("/scans/anna.ply",)]).html()
 
 
+def test_names_in_a_chart_are_no_formulas():
+    from matplotlib.figure import Figure
+
+    figure = Figure()
+    axes = figure.subplots()
+    axes.plot([0, 1], label="$\\frac{$")
+    axes.set_yticks([0, 1], ["a$b$", "$\\nothing$\nmore"])
+    axes.legend()
+    assert "<svg" in Page("a").chart(figure).html() or "data:image/svg" in Page("a").chart(figure).html()
+
+
 def test_a_chart_gives_the_same_bytes_every_time():
     from matplotlib.figure import Figure
 

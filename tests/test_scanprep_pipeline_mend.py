@@ -4,6 +4,7 @@ import time
 
 import pytest
 from browser import take_away, wait_until
+from click_app import allowed
 from scan_folders import MARKS, WITH_PICTURES, ball, contents, write_scans
 
 from scanprep import RegisteredSet, read_mesh, write_landmarks, write_mesh
@@ -17,7 +18,7 @@ from scanprep.pipeline.again import Call
 from scanprep.pipeline.cli import carry_out
 from scanprep.pipeline.mend import MendApp
 from scanprep.viewer import pick
-from scanprep.viewer.clicked import KEPT, Clicked
+from scanprep.viewer.clicked import Clicked
 from scanprep.viewer.messages import Message
 from scanprep.viewer.server import Server
 
@@ -88,7 +89,7 @@ def test_what_a_set_was_made_with_is_read_back(place):
 
 
 def test_exchanged_landmarks_are_mended_and_only_that_scan_is_registered(place):
-    app = MendApp(place / "set", ENDING)
+    app = allowed(MendApp(place / "set", ENDING))
     state = app.greet()[-1].fields
     assert state["scans"][0]["name"] == "body1.ply"                                      # worst first
     assert [v["verdict"] for v in state["verdicts"]][1:] == ["good", "good"]
@@ -104,10 +105,10 @@ def test_exchanged_landmarks_are_mended_and_only_that_scan_is_registered(place):
     after = contents(place)
     changed = {name for name in after if after[name] != before.get(name)}
     assert {name for name in changed if not name.startswith("set/")} == {
-        "scans/body1.landmarks.json", "scans/body1.landmarks.json" + KEPT}
+        "scans/body1.landmarks.json", "scans/body1.landmarks.json.before"}
     assert {name for name in changed if "body" in name and name.startswith("set/")} <= {
         "set/meshes/body1.ply", "set/pictures/body1.webp", "set/pictures/body1.scene"}
-    assert after["scans/body1.landmarks.json" + KEPT] == before["scans/body1.landmarks.json"]
+    assert after["scans/body1.landmarks.json.before"] == before["scans/body1.landmarks.json"]
     assert (place / "set" / "report.html").read_bytes() != page
     scene = app.scene()
     assert len(scene.data) - scene.fields["first"] == len(after["set/pictures/body1.scene"])
@@ -119,7 +120,7 @@ def test_exchanged_landmarks_are_mended_and_only_that_scan_is_registered(place):
 
 def test_only_what_has_changed_is_registered_again(place):
     """Also what was changed before the page was opened; a click that was taken back is no change."""
-    app = MendApp(place / "set", ENDING)
+    app = allowed(MendApp(place / "set", ENDING))
     state = app.greet()[-1].fields
     assert state["changed"] == [] and not state["template_changed"] and not state["outdated"]
     with pytest.raises(ValueError, match="nothing has changed"):
@@ -131,7 +132,7 @@ def test_only_what_has_changed_is_registered_again(place):
     sent(app, "open", scan=1)
     sent(app, "remove", pane=1, name="top")
     write_mesh(place / "scans" / "body9.ply", ball())
-    again = MendApp(place / "set", ENDING).greet()[-1].fields
+    again = allowed(MendApp(place / "set", ENDING)).greet()[-1].fields
     assert again["changed"] == [app.scan_names[1], "body9"] and not again["outdated"]
     sent(app, "remove", pane=0, name="top")
     assert app.greet()[-1].fields["template_changed"]
@@ -141,13 +142,13 @@ def test_where_nobody_named_a_landmark_those_of_people_are_offered(place):
     """A set that was made without any: the landmarks of template and scans are clicked one after the other."""
     for path in place.rglob("*landmarks.json"):
         path.write_text("{}")
-    app = MendApp(place / "set", ENDING)
+    app = allowed(MendApp(place / "set", ENDING))
     assert app.names == TEN and app.building and app.chosen == TEN[0]
     assert pick.PickApp(Clicked.load(place / "set" / "template.ply", ENDING), [], TEN).names == TEN
 
 
 def test_another_run_on_the_set_is_told_and_nothing_is_lost(place):
-    app = MendApp(place / "set", ENDING)
+    app = allowed(MendApp(place / "set", ENDING))
     mend(app, place)
     before = contents(place / "set")
     with lock_output(place / "set" / HOME / "lock", place / "set"):
@@ -162,7 +163,7 @@ def test_another_run_on_the_set_is_told_and_nothing_is_lost(place):
 
 def test_new_landmark_files_lie_where_the_run_reads_them(place):
     (place / "scans" / "body2.landmarks.json").unlink()
-    app = MendApp(place / "set", ".pp")
+    app = allowed(MendApp(place / "set", ".pp"))
     scan = app.scans[app.scan_names.index("body2")]
     assert scan.file == place / "scans" / "body2.pp" and not scan.places
     app.call = Call(app.call.scans, app.call.template, place / "marks", config=app.call.config)
@@ -173,7 +174,7 @@ def test_new_landmark_files_lie_where_the_run_reads_them(place):
 @pytest.mark.slow
 def test_a_set_is_mended_in_the_browser(new_page, place):
     """The wrong landmarks are taken away by key, the scan is registered again by a button: all is new."""
-    app = MendApp(place / "set", ENDING)
+    app = allowed(MendApp(place / "set", ENDING))
     with Server(app) as server:
         page = new_page(viewport={"width": 1200, "height": 800})
         page.goto(server.opening())

@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from click_app import allowed
 from scan_folders import WITH_PICTURES, ball, contents
 
 from model.coregistration.lead import ModelLead
@@ -81,7 +82,7 @@ def test_both_bodies_are_in_the_set_and_on_its_page(call, tmp_path):
 
 def test_the_other_body_is_taken_and_taken_back(call, tmp_path):
     folder = tmp_path / "set"
-    app = MendApp(folder)
+    app = allowed(MendApp(folder))
     assert app.scan_names == ["beside", "alone"] and app.state().fields["rivals"] == [True, False]
     before = contents(folder)
     press(app)
@@ -103,7 +104,7 @@ def test_the_other_body_is_taken_and_taken_back(call, tmp_path):
 
 def test_nothing_is_taken_where_there_is_no_rival_or_the_scan_has_changed(call, tmp_path):
     folder = tmp_path / "set"
-    app, before = MendApp(folder), contents(folder)
+    app, before = allowed(MendApp(folder)), contents(folder)
     app.handle(Message("open", {"scan": 1}), lambda message: None)
     press(app)
     assert "alone: there is no other body" in app.note and contents(folder) == before
@@ -120,7 +121,7 @@ def test_nothing_is_taken_where_there_is_no_rival_or_the_scan_has_changed(call, 
 def test_a_choice_is_not_made_again_through_a_model_of_the_set(call, tmp_path, monkeypatch, chosen):
     """A scan with something beside it stays doubted; it is registered again unless somebody chose its body."""
     if chosen:
-        press(MendApp(tmp_path / "set"))
+        press(allowed(MendApp(tmp_path / "set")))
 
     def teach(place, work, config, lessons, folder):
         (folder / place).parent.mkdir()
@@ -132,7 +133,7 @@ def test_a_choice_is_not_made_again_through_a_model_of_the_set(call, tmp_path, m
     folder, rounds = tmp_path / "set", tmp_path / "set" / "again1"
     assert run(call, folder) == (0 if chosen else 1) and (rounds / "rivals" / "beside.ply").is_file() != chosen
     if not chosen:                                # of the later registration the other body can be taken too
-        app, found = MendApp(folder), contents(rounds)
+        app, found = allowed(MendApp(folder)), contents(rounds)
         assert app.state().fields["rivals"] == [True, False]
         press(app)
         now = contents(folder)

@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 import trimesh
 from browser import wait_until
+from hostile_messages import check_it_goes_on
 
 from scanprep.geometry.files import write_mesh
 from scanprep.geometry.landmark_names import FACE
@@ -170,3 +171,7 @@ def test_joints_are_clicked_in_the_browser(new_page, app, true_joints):
         assert "80% of the way" in page.locator(".sk-depth").inner_text()
         assert page.errors == []
     assert json.loads(app.template.file.read_text()).keys() == true_joints.keys()
+
+
+def test_hostile_messages_are_refused_in_a_line(app, capfd):
+    check_it_goes_on(app, capfd)

@@ -5,6 +5,7 @@ import time
 import numpy as np
 import pytest
 from browser import wait_until
+from hostile_messages import check_it_goes_on
 
 from scanprep.geometry import rotations
 from scanprep.geometry.files import write_mesh
@@ -14,7 +15,7 @@ from scanprep.pictures.shading import sphere
 from scanprep.pipeline.pick import pick_landmarks
 from scanprep.synthetic.landmarks import landmarks
 from scanprep.synthetic.people import SyntheticPerson
-from scanprep.viewer.clicked import KEPT, Clicked, camera_like, camera_of, predict_landmarks
+from scanprep.viewer.clicked import Clicked, camera_like, camera_of, predict_landmarks
 from scanprep.viewer.landmark_names import CAESAR, TEN, next_name, read_names
 from scanprep.viewer.messages import Message
 from scanprep.viewer.pick import PickApp
@@ -145,7 +146,7 @@ def test_a_file_of_the_user_is_kept_as_it_was(folder, person):
     app = app_of(folder)
     for name in FOUR[:2]:
         click(app, moved(person.mesh.vertices[landmarks()[name]]), name)
-    assert (folder / ("anna.pp" + KEPT)).read_bytes() == before
+    assert (folder / ("anna.pp.before")).read_bytes() == before
     assert set(read_landmarks(mine)) >= {"my own"}
 
 
@@ -160,7 +161,7 @@ def test_what_was_taken_back_leaves_no_file_behind(folder, person):
     assert not list(folder.glob("anna.l*"))
     assert app_of(folder).scans[0].places == {}
     sent(app, "redo")
-    assert set(read_landmarks(app.scans[0].file)) == {"a"} and not list(folder.glob("*" + KEPT))
+    assert set(read_landmarks(app.scans[0].file)) == {"a"} and not list(folder.glob("*.before"))
 
 
 @pytest.mark.parametrize("ending", [".landmarks.json", ".pp", ".mrk.json", ".lnd", ".txt"])
@@ -583,3 +584,7 @@ def test_the_instruction_stands_above_the_bodies(folder, person, new_page, width
         page.locator(".sk-question button").filter(has_text="keep").click()
         wait_until(page, "program.state.question === null && document.querySelector('.sk-question').hidden")
         assert "left toe" in app.scans[0].places and not page.errors
+
+
+def test_hostile_messages_are_refused_in_a_line(folder, capfd):
+    check_it_goes_on(app_of(folder), capfd)

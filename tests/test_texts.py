@@ -11,7 +11,8 @@ import pytest
 ROOT = Path(__file__).parents[1]
 PACKAGES = ("scanprep", "model", "completion")
 PAGES = [ROOT / "README.md", *(ROOT / package / "README.md" for package in PACKAGES),
-         ROOT / ".github" / "CONTRIBUTING.md", *sorted((ROOT / ".docs" / "pages").rglob("*.md"))]
+         ROOT / ".github" / "CONTRIBUTING.md", ROOT / ".github" / "SECURITY.md",
+         *sorted((ROOT / ".docs" / "pages").rglob("*.md"))]
 NAMES = [str(page.relative_to(ROOT)) for page in PAGES]
 # the longest page of each kind, in lines
 LONGEST = {"README.md": 150, ".github/CONTRIBUTING.md": 100, **{f"{package}/README.md": 120 for package in PACKAGES}}

@@ -62,7 +62,7 @@ def measure_demo(demo: Demo) -> list[Metric]:
 def judge_demo(demo: Demo, metrics: Sequence[Metric]) -> Judgement:
     """Judge the demonstration: each result's own judgement, its distance from the truth, and names of parts."""
     folder = demo.folder / "set"
-    set_of_scans = judge_whole(judge_set(folder), RegisteredSet.load(folder).skeleton)
+    set_of_scans = judge_whole(judge_set(folder), RegisteredSet.load(folder))
     motion = Judgement.of(check=motion_doubts([demo.motion], [demo.walk[0]], demo.template))
     of_results = judge_many({"registration": set_of_scans, "model": judge_model(demo.model),
                              "completion": demo.completion.judgement, "animation": motion})

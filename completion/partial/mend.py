@@ -28,7 +28,10 @@ from .work import CompletionInputs
 
 def mend_completions(folder: Path) -> CompletionsApp:
     """Return the app for an output folder of `scape complete`; ValueError for a folder without its settings."""
-    return CompletionsApp(FolderCall.read(folder), folder)
+    call = FolderCall.read(folder)
+    app = CompletionsApp(call, folder)
+    app.outside = call.ask_outside(folder)
+    return app
 
 
 class CompletionsApp(ResultsApp, CompleteApp):

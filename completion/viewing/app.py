@@ -14,7 +14,7 @@ import numpy as np
 from scanprep.pictures.scene import pack_scene
 from scanprep.viewer.app import App, Send
 from scanprep.viewer.dropped import Dropped, with_camera
-from scanprep.viewer.messages import Message
+from scanprep.viewer.messages import Message, call_action, find_action
 
 from .arrangement import arrange_side_by_side, over_each_other
 from .controls import Controls, Shown
@@ -115,7 +115,7 @@ class ViewApp(Things):
 
         self.note = ""
         try:
-            return self.inside.enter(self.entries, wanted, progress)
+            return call_action(self.inside.enter, wanted, self.entries, progress)
         finally:
             self.working = None
 
@@ -165,13 +165,11 @@ class ViewApp(Things):
     def handle(self, message: Message, send: Send) -> None:
         """Act on a slider, a button or a click."""
         if (move := MOVES.get(message.kind)) is not None:
-            move(self.controls, **message.fields)
+            call_action(move, message.fields, self.controls)
             for one in self.controls.shown:
                 send(self._vertices_now(one))
-        elif (action := getattr(self, f"on_{message.kind}", None)) is not None:
-            action(send, **message.fields)
         else:
-            raise ValueError(f"a message of kind '{message.kind}', which nothing here answers")
+            call_action(find_action(self, message.kind), message.fields, send)
 
     def receive(self, name: str, path: Path, send: Send) -> None:
         """Show a file dropped on the page with the other things; ValueError for one that cannot be shown."""
@@ -189,7 +187,7 @@ class ViewApp(Things):
 
     def on_show(self, send: Send, entries: list[int]) -> None:
         """Show other things; if none can be read, keep the present ones."""
-        wanted = [i for i in entries if 0 <= i < len(self.entries)]
+        wanted = [i for i in dict.fromkeys(entries) if 0 <= i < len(self.entries)]
         before = self.shown, self.contents, self.bodies
         self.show(wanted)
         if not self.shown:

@@ -86,21 +86,20 @@ class Inside:
                 "models": [{"path": "", "name": self.PEOPLE},
                            *({"path": str(path), "name": path.name} for path in self.files.models)]}
 
-    def enter(self, entries: Sequence[Entry], wanted: Mapping[str, Any], progress: Progress) -> App:
-        """Open a page of a folder, or the completion of a scan.
-
-        `wanted` has "what", the page, and either "folder", or "scan", its number, and "model", a file or "".
-        """
-        if wanted["what"] == "complete":
-            return self._completion(entries[int(wanted["scan"])], wanted["model"], progress)
-        what, known = wanted["what"], self.files.folders(entries)
-        folder = next((folder for folder in known if str(folder) == wanted["folder"]), None)
-        command = "" if folder is None else command_of(folder)
-        if what != "mend" or folder is None or command not in MENDED:
-            raise ValueError(f"page: expected one that the list of things offers, got {what} of {wanted['folder']}")
-        if (what, folder) not in self.opened:
-            self.opened[what, folder] = load_command(MENDED[command][1])(folder)
-        return self.opened[what, folder]
+    def enter(self, entries: Sequence[Entry], progress: Progress, what: str, folder: str = "", scan: int = -1,
+              model: str = "") -> App:
+        """Open the page `what`: of a folder, or the completion of a scan, by its number, with a model, a file or ""."""
+        if what == "complete":
+            if not 0 <= scan < len(entries):
+                raise ValueError(f"scan: expected 0 to {len(entries) - 1}, got {scan}")
+            return self._completion(entries[scan], model, progress)
+        place = next((place for place in self.files.folders(entries) if str(place) == folder), None)
+        command = "" if place is None else command_of(place)
+        if what != "mend" or place is None or command not in MENDED:
+            raise ValueError(f"page: expected one that the list of things offers, got {what} of {folder}")
+        if (what, place) not in self.opened:
+            self.opened[what, place] = load_command(MENDED[command][1])(place)
+        return self.opened[what, place]
 
     def _completion(self, scan: Entry, model: str, progress: Progress) -> App:
         """Open the page that completes scans with a model, and show a scan there."""

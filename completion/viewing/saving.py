@@ -1,6 +1,7 @@
 """Save bodies and poses of the sliders, never over an existing file."""
 from __future__ import annotations
 
+import os
 from collections.abc import Callable
 from pathlib import Path
 
@@ -38,6 +39,6 @@ def _save(controls: Controls, folder: Path, ending: str, write: Callable[[Path, 
 def free_name(path: Path) -> Path:
     """Return the path, or the first one with a number that does not exist yet."""
     candidate, number = path, 2
-    while candidate.exists():
+    while os.path.lexists(candidate):
         candidate, number = path.with_stem(f"{path.stem}_{number}"), number + 1
     return candidate

@@ -16,7 +16,7 @@ from scanprep.console import Metric, Outcome, bar, details
 from scanprep.dataset import RegisteredSet
 from scanprep.geometry.files import list_meshes, name_of
 from scanprep.geometry.landmarks import read_landmark_vertices
-from scanprep.geometry.members import check_members, find_spikes
+from scanprep.geometry.members import ONE_BODY, check_members, find_doubtful_members
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.tables import read_table
 from scanprep.judgement import carry_judgements
@@ -90,10 +90,11 @@ def learn(poses: Path, output: Output, shapes: Path | None = None, template: Pat
     (body, posed, names), who = (_read_mix(poses) if kind == "mixed" else
                                  (read_poses(poses, template, subject, unit), []))
     body = body if up is None else replace(body, up="xyz".index(up))
-    people, spikes = None, find_spikes(body, posed, str(poses), names)
+    people = None
+    doubts = find_doubtful_members(body, posed, str(poses), names, np.inf if kind == "mixed" else ONE_BODY)
     if shapes is not None:
         people, names = _read_people(shapes, body, unit)
-        spikes += find_spikes(body, people, str(shapes), names)
+        doubts += find_doubtful_members(body, people, str(shapes), names)
     sexes = None if not by_sex or shapes is None else _read_sexes(shapes)
     marks = landmarks or poses / "landmarks.json"
     named = read_landmark_vertices(marks, body) if landmarks or marks.exists() else {}
@@ -107,7 +108,7 @@ def learn(poses: Path, output: Output, shapes: Path | None = None, template: Pat
                              sexes=sexes or (), people=who, landmarks=named, stage=bar, step=step)
     except ModelMismatchError as error:
         raise ValueError(f"--{error}") from error
-    learned = learned.with_info(spikes=spikes)
+    learned = learned.with_info(spikes=doubts)
     tree = learned.model.skeleton
     if learned.choice is not None:
         note_numbered_parts(tree)

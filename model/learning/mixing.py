@@ -14,7 +14,7 @@ from operator import attrgetter
 import numpy as np
 
 from scanprep.batch.room import Step, run_uncached
-from scanprep.geometry.members import check_members, find_spikes
+from scanprep.geometry.members import check_members, find_doubtful_members
 from scanprep.geometry.mesh import Mesh, check_template
 from scanprep.geometry.upright import find_up
 from scanprep.skeleton.tree import Skeleton
@@ -126,7 +126,7 @@ def learn_scape_mix(template: Mesh, bodies: np.ndarray, subjects: Sequence[Hasha
     return ScapeModel(template, skeleton, state.space, shapes, *prior, {
         "settings": asdict(config), "bodies": len(bodies), "people": int(who.max()) + 1, "rounds": config.refinements,
         "pruning": state.design.pruning, "ridge": state.design.ridge, "features": state.space.features.count,
-        "spikes": find_spikes(template, bodies, "bodies"),
+        "spikes": find_doubtful_members(template, bodies, "bodies", ratio=np.inf),
         "digest": digest(template, bodies, None), "digests": body_digests(bodies)}, pose_examples=examples)
 
 

@@ -12,7 +12,7 @@ import numpy as np
 
 from scanprep.batch.pool import SideBySide
 from scanprep.batch.room import Step, run_uncached, substeps
-from scanprep.geometry.members import ONE_BODY, check_members, find_spikes
+from scanprep.geometry.members import ONE_BODY, check_members, find_doubtful_members
 from scanprep.geometry.mesh import Mesh, check_template, take_any_mesh
 from scanprep.geometry.rotations import procrustes
 from scanprep.geometry.upright import find_up
@@ -33,6 +33,7 @@ from ..fitting.vertices import FitConfig, PoseFitter
 from ..gradients import GradientSystem, ShapeSolver, pose_gradients, shape_gradients
 from ..human_poses import mix_moments, with_human_poses
 from ..linear import Subject
+from ..people import person_judgement
 from ..pose_space import PoseSpace
 from ..priors import CRUDE, STIFF, stiff_joints
 from ..scape import BlendScapeModel, ScapeModel
@@ -465,15 +466,16 @@ def check_training(template: Mesh, skeleton: Skeleton, poses: np.ndarray, shapes
 
 
 def describe_bodies(template: Mesh, poses: np.ndarray, shapes: np.ndarray | None) -> dict[str, Any]:
-    """Collect what a model keeps of its poses (M, N, 3) and people (P, N, 3): numbers, spikes and digests.
+    """Collect what a model keeps of its poses (M, N, 3) and people (P, N, 3): numbers, doubts and digests.
 
     `pose_distance`, metres, is the mean distance of the poses' vertices from the template's, apart from place and turn.
     """
     off = [np.linalg.norm(body @ R.T + t - template.vertices, axis=1).mean() for body in poses
            for R, t in [procrustes(body, template.vertices)]]
-    spikes = find_spikes(template, poses, "poses") + ([] if shapes is None else find_spikes(template, shapes, "shapes"))
+    doubts = find_doubtful_members(template, poses, "poses", ratio=ONE_BODY)
+    doubts += [] if shapes is None else find_doubtful_members(template, shapes, "shapes")
     return {"poses": len(poses), "shapes": 0 if shapes is None else len(shapes), "pose_distance": float(np.mean(off)),
-            "spikes": spikes, "digest": digest(template, poses, shapes), "digests": body_digests(poses, shapes)}
+            "spikes": doubts, "digest": digest(template, poses, shapes), "digests": body_digests(poses, shapes)}
 
 
 def check_skeleton(template: Mesh, skeleton: Skeleton) -> None:
@@ -489,7 +491,8 @@ def check_skeleton(template: Mesh, skeleton: Skeleton) -> None:
 def judge_model(model: BodyModel, people: np.ndarray | None = None) -> Judgement:
     """Judge a model learned with people (S, N, 3), metres: whether it is useless, and what it lacks.
 
-    That is joints that never bent, and parts that are not rigid; spiked bodies are named.
+    That is a body of a size that nobody has, bodies that do not belong together, joints that never bent, and parts that
+    are not rigid.
     """
     learned = model.info.get("poses", 0)                # imported models were not learned from poses
     known = "joints_of_prior" in model.info             # a prior knows the joints that no pose bends
@@ -518,7 +521,10 @@ def judge_model(model: BodyModel, people: np.ndarray | None = None) -> Judgement
     if not known and learned > 1 and 0 < distance < error / UNEXPLAINED:
         doubts += [f"the joints explain little: poses that differ by {1000 * distance:.3g} mm are predicted "
                    f"{1000 * error:.3g} mm off: a body without rigid parts, or too few poses?"]
-    return Judgement.of(learning_problem(model, people), doubts)
+    # a person whom nobody resembles: the template's own body as its poses have it, and the mean of the people
+    sizes = [person_judgement(model, betas, "a child or a giant, or the wrong unit? (--unit)")
+             for betas in (None, *([np.zeros(model.n_betas)] if model.n_betas else []))]
+    return Judgement.of(learning_problem(model, people)).merge(*sizes, Judgement.of(check=doubts))
 
 
 def learning_problem(model: BodyModel, people: np.ndarray | None = None) -> str | None:

@@ -1,7 +1,6 @@
 """A statue on disk: control model, images over its chart, and files for other commands and programs (glTF, X3D)."""
 from __future__ import annotations
 
-import io
 import re
 from pathlib import Path
 from xml.etree import ElementTree
@@ -9,9 +8,9 @@ from xml.etree import ElementTree
 import numpy as np
 
 from scanprep.geometry import storage
+from scanprep.geometry.images import open_image
 from scanprep.geometry.mesh import Mesh
 from scanprep.pictures.sheets import save_png
-from scanprep.pictures.textures import check_pixels
 from scanprep.synthetic import people
 
 from ..blend_weights import strongest
@@ -99,8 +98,6 @@ def load_statue(folder: str | Path, edited: str | Path | None = None) -> Statue:
     >>> load_statue("statue").map.heights.shape
     (16, 16)
     """
-    from PIL import Image
-
     folder, texture = Path(folder), None
     about = storage.read_json(folder / ABOUT, "a folder of scape statue fit")
     if not isinstance(about, dict) or about.get("kind") != KIND:
@@ -113,9 +110,7 @@ def load_statue(folder: str | Path, edited: str | Path | None = None) -> Statue:
         pose = storage.numbers({"pose": np.array(about["pose"], dtype=np.float64)}, "pose",
                                len(control.skeleton.parents), 3)
     if about.get("texture"):
-        data = storage.read_bytes(folder / TEXTURE, "the texture of the statue")
-        with storage.taking_apart(folder / TEXTURE, "the texture of the statue"), Image.open(io.BytesIO(data)) as image:
-            check_pixels(image.size)
+        with open_image(folder / TEXTURE, "the texture of the statue") as image:
             texture = np.asarray(image.convert("RGB"))
     return Statue(control, pose, read_map(folder, edited), texture)
 

@@ -13,7 +13,7 @@ from typing import Any, ClassVar, TypeVar
 from .. import config_files
 from ..geometry import storage
 from ..ranges import Settings
-from .digests import with_paths
+from .digests import paths_of, with_paths
 from .ownership import HOME
 
 # name of the file, version of its format, and what its kind begins with; all three are in files of users
@@ -41,6 +41,17 @@ class KeptCall:
         stored |= {name: str(find_place(Path(stored[name]))) for name in self.may_be_files if stored[name]}
         stored["config"] = config_files.write_settings({"config": stored["config"]})
         storage.write_json(folder / RUN, {"kind": _kind(self), "version": VERSION, **stored})
+
+    def ask_outside(self, folder: Path) -> str:
+        """Return the question whether files outside of the folder are right, which the call names; empty without any.
+
+        A folder may come from a stranger: nothing outside of it is changed before the user has read where it is.
+        """
+        named = [*paths_of(self), *(Path(text) for name in self.may_be_files if (text := getattr(self, name)))]
+        home = folder.resolve()
+        outside = [str(path) for path in named if path.is_absolute() and not path.resolve().is_relative_to(home)]
+        return (f"{_file(folder)} names {', '.join(dict.fromkeys(outside))}, outside of {folder}: they are read, and "
+                "what you change of them is saved there. If that is right, do it once more") if outside else ""
 
     @classmethod
     def read(cls: type[Of], folder: Path) -> Of:

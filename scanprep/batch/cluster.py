@@ -112,7 +112,7 @@ def _outcome(future: Any, job: Job, address: str) -> Any:
         for name, data in files.items():
             path = storage.path_inside(job.folder, name, address)
             path.parent.mkdir(parents=True, exist_ok=True)
-            path.write_bytes(data)
+            storage.create_file(path, data)
         return value
     if isinstance(error, KilledWorker):
         return Failure(f"{job.name}: the workers at work on it died, one after another")

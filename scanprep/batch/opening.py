@@ -107,7 +107,9 @@ def lock_output(path: Path, output: Path, wait: bool = False) -> Iterator[None]:
         Another run holds the lock, unless `wait`.
     """
     while True:
-        with open(path, "a+", encoding="utf-8") as file:
+        # never through a link, which would write elsewhere
+        flags = os.O_RDWR | os.O_CREAT | os.O_APPEND | getattr(os, "O_NOFOLLOW", 0)
+        with open(os.open(path, flags, 0o666), "a+", encoding="utf-8") as file:
             if not _take(file):
                 if wait:
                     # seconds between two attempts: short for the user, no load for the machine

@@ -273,7 +273,7 @@ class Workspace:
         """
         files, blocked = self.digests.of_files(staged), list[Path]()
         for file, digest in files.items():
-            place = storage.path_inside(self.folder, file, self.folder)      # refuses links that lead out of the output
+            place = storage.place_to_write(self.folder, file, self.folder)
             if place.is_dir() or any(p.is_file() for p in place.parents if self.folder in p.parents) \
                     or (place.exists() and self.digests.of_file(place) != digest and not self.is_ours(file)):
                 blocked.append(place)
@@ -303,8 +303,9 @@ class Workspace:
         # move the new files, then remove those that only the former result had
         for file in header["files"]:
             if (ready / file).exists():                     # otherwise it was moved before the run was killed
-                (self.folder / file).parent.mkdir(parents=True, exist_ok=True)
-                os.replace(ready / file, self.folder / file)
+                place = storage.place_to_write(self.folder, file, ready / RECORD)
+                place.parent.mkdir(parents=True, exist_ok=True)
+                os.replace(ready / file, place)
         for file, digest in former_files.items():
             if file not in header["files"]:
                 self._remove(file, digest)

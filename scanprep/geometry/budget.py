@@ -18,8 +18,8 @@ from pathlib import Path
 FREE, PER_BYTE = 2**27, 100
 # Nodes, instances and primitives: each is at least one byte of a file, but instances may share theirs.
 VISITS = 100_000
-# Seconds of the processor, and as many for each MB: a file of small polygons takes 1 s for a MB.
-SECONDS, PER_MB = 6.0, 2.0
+# Seconds of the processor, and as many for each MB: a file of small polygons takes 1 s for a MB, on a fast machine.
+SECONDS, PER_MB = 6.0, 4.0
 
 
 @dataclass

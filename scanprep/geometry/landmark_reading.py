@@ -12,6 +12,7 @@ import numpy as np
 
 from . import storage
 from .format_common import UNITS, Lines, MeshFileError, quote
+from .tables import text_of_cell
 
 Entry = np.ndarray | int | dict[str, Any]        # point, vertex, or face with barycentric coordinates
 _Points = list[tuple[str, np.ndarray]]
@@ -202,7 +203,7 @@ def _cells(lines: Lines, row: int, mark: str) -> list[str]:
     """Split a row of a table into cells."""
     try:
         text = lines.text[row].decode("utf-8-sig")
-        return [word.strip() for word in next(csv.reader([text], delimiter=mark, strict=True))]
+        return [text_of_cell(word.strip()) for word in next(csv.reader([text], delimiter=mark, strict=True))]
     except (csv.Error, UnicodeDecodeError, StopIteration):
         raise lines.fail(row, f"text in columns, parted by {mark!r}") from None
 

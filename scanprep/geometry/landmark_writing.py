@@ -1,16 +1,15 @@
 """Write landmark files of other programs; the counterpart of `landmark_reading`."""
 from __future__ import annotations
 
-import csv
-import io
 import json
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from typing import Literal
 from xml.sax.saxutils import escape, quoteattr
 
 import numpy as np
 
 from .format_common import UNITS
+from .tables import csv_text
 
 Points = Mapping[str, np.ndarray]
 Format = Literal["json", "pp", "mrk.json", "fcsv", "scalismo.json", "csv", "lnd", "txt"]
@@ -62,7 +61,7 @@ def _fiducials(points: Points, unit: str | None) -> str:
     columns = "id,x,y,z,ow,ox,oy,oz,vis,sel,lock,label,desc,associatedNodeID"
     rows = [(i + 1, *point, 0, 0, 0, 1, 1, 1, 0, name, "", "")
             for i, (name, point) in enumerate(_as_text(points, unit or "mm"))]
-    return (f"# Markups fiducial file version = 4.11\n# CoordinateSystem = LPS\n# columns = {columns}\n" + _csv(rows))
+    return f"# Markups fiducial file version = 4.11\n# CoordinateSystem = LPS\n# columns = {columns}\n{csv_text(rows)}"
 
 
 def _scalismo(points: Points, unit: str | None) -> str:
@@ -73,7 +72,7 @@ def _scalismo(points: Points, unit: str | None) -> str:
 
 def _table(points: Points, unit: str | None) -> str:
     """Encode a CSV table."""
-    return _csv([("name", "x", "y", "z"), *((name, *point) for name, point in _as_text(points, unit or "m"))])
+    return csv_text([("name", "x", "y", "z"), *((name, *point) for name, point in _as_text(points, unit or "m"))])
 
 
 def _marker_set(points: Points, unit: str | None) -> str:
@@ -90,13 +89,6 @@ def marker_set(markers: Mapping[str, tuple[str, np.ndarray]]) -> str:
     return ('<?xml version="1.0" encoding="UTF-8" ?>\n'
             '<OpenSimDocument Version="40000">\n <MarkerSet name="markerset">\n'
             f"  <objects>\n{rows}  </objects>\n  <groups />\n </MarkerSet>\n</OpenSimDocument>\n")
-
-
-def _csv(rows: Iterable[Sequence[object]]) -> str:
-    """Encode rows as CSV."""
-    out = io.StringIO()
-    csv.writer(out, lineterminator="\n").writerows(rows)
-    return out.getvalue()
 
 
 def _as_text(points: Points, unit: str) -> list[tuple[str, list[str]]]:

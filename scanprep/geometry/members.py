@@ -1,4 +1,4 @@
-"""Registered bodies compared with each other: which is mirrored, of another size or vertex order, or spiked."""
+"""Registered bodies compared with each other: mirrored, copied, spiked, of another size, person or vertex order."""
 from __future__ import annotations
 
 from collections.abc import Sequence
@@ -10,6 +10,12 @@ from .mesh import Mesh
 # How many times as large as the others a body may be. 71 SCAPE poses of one man have 0.98 to 1.03, 227 SPRING men 0.90
 # to 1.12. An adult is up to three times as large as a child; a metre is 3.28 feet.
 ONE_BODY, ONE_KIND = 1.15, 3.0
+# Sizes of SEVERAL bodies or more: a standard deviation beyond DIFFER is that of different people, and one below ALIKE
+# that of one. In samples of 8 SCAPE has 0.002 to 0.015, SPRING 0.018 and more in 99 of 100.
+SEVERAL, DIFFER, ALIKE = 5, 0.02, 0.012
+# Copies lie on each other within this share of their radius, whatever their place and scale: 6 mm on a man. The nearest
+# two people of SPRING are 17 mm apart, the nearest two poses of SCAPE 42 mm. So many vertices are compared.
+COPIED, COMPARED = 0.01, 300
 # Vertices in another order make more than this share of the edges twice or half as long: 12% or more even where each is
 # exchanged for the next one. SCAPE, SPRING, animals and a hand of four fingers have at most 2%.
 ANOTHER_ORDER, FACTOR = 0.08, 2.0
@@ -70,21 +76,70 @@ def check_members(template: Mesh, bodies: np.ndarray, name: str, names: Sequence
         raise ValueError(f"{name}: the bodies are mirror images of the template")
 
 
-def find_spikes(template: Mesh, bodies: np.ndarray, name: str, names: Sequence[str] = ()) -> list[str]:
-    """Describe each body that has vertices far from their neighbours; arguments are those of `check_members`."""
-    torn = _compare_edges(template, bodies)[2]
-    doubts = []
+def find_doubtful_members(template: Mesh, bodies: np.ndarray, name: str, names: Sequence[str] = (),
+                          ratio: float = ONE_KIND) -> list[str]:
+    """Describe what needs a look in bodies that `check_members`, whose arguments these are, lets pass.
+
+    A set of another size than the template, poses of different people, one body as many, copies, and spikes. An
+    infinite `ratio` is for a mix, in which one body may have several poses.
+    """
+    scale, _, torn = _compare_edges(template, bodies)
+    most, copies = float(np.median(scale)), _find_copies(bodies, COPIED if ratio == ONE_KIND else COPIED / 10)
+    doubts = find_several_people(scale, name) if ratio == ONE_BODY else []
+    # all bodies together: their size, and how much they differ in it
+    if not 1 / ratio < most < ratio:
+        doubts.append(f"{name}: the bodies are {most:.3g} times as large as the template: the wrong unit, or the "
+                      "template of somebody else?")
+    if ratio == ONE_KIND and len(scale) >= SEVERAL and not copies and (spread := np.log(scale).std(ddof=1)) < ALIKE:
+        doubts.append(f"{name}: the bodies differ in size by {100 * spread:.2g}% only: one body in many poses, instead "
+                      "of many people?")
+    # single bodies: copies; and spikes, of which all edges are torn, and one of each neighbour
+    for first, *others in copies:
+        also = ", ".join(_label("", names, i) for i in others[:3]) + f" and {len(others) - 3} more" * (len(others) > 3)
+        doubts.append(f"{_label(name, names, first)}: {also} is the same body in the same pose: leave out the copies")
     for i in np.flatnonzero(torn.any(axis=1)).tolist():
-        # all edges of a spike are torn, and one of each of its neighbours
         spike = np.bincount(template.edges[torn[i]].ravel()).argmax()
         doubts.append(f"{_label(name, names, i)}: vertex {spike} is a spike, {torn[i].sum()} edges are torn: mend it, "
                       "or leave it out")
     return doubts
 
 
+def find_several_people(scales: np.ndarray, name: str) -> list[str]:
+    """Describe poses of one body whose sizes, `scales` (n,), differ as those of different people do."""
+    spread = float(np.log(scales).std(ddof=1)) if len(scales) >= SEVERAL else 0.0
+    return [f"{name}: the bodies differ in size by {100 * spread:.2g}%: different people, of whom each needs poses of "
+            "their own?"] if spread > DIFFER else []
+
+
+def measure_scales(template: Mesh, bodies: np.ndarray) -> np.ndarray:
+    """Measure how many times as large as the template each body (n, N, 3) is, (n,): the median of its edges."""
+    return _compare_edges(template, bodies)[0]
+
+
+def _find_copies(bodies: np.ndarray, apart: float) -> list[list[int]]:
+    """Group bodies (n, N, 3) that are equal up to place, turn and scale, by their numbers.
+
+    `apart` is the largest distance, as a share of the radius.
+    """
+    points = np.asarray(bodies[:, ::max(1, bodies.shape[1] // COMPARED)], dtype=np.float64)
+    points = points - points.mean(axis=1, keepdims=True)
+    points /= np.linalg.norm(points, axis=(1, 2), keepdims=True)
+    groups, left = list[list[int]](), np.arange(len(points))
+    while len(left):
+        # squared distance after the best turn: 2 - 2 (sum of the singular values, the last with the sign of the turn)
+        across = np.einsum("ni,pnj->pij", points[left[0]], points[left])
+        values = np.linalg.svd(across, compute_uv=False)
+        values[:, 2] *= np.sign(np.linalg.det(across))
+        same = 2 - 2 * values.sum(axis=1) < apart**2
+        same[0] = True
+        groups.append(left[same].tolist())
+        left = left[~same]
+    return [group for group in groups if len(group) > 1]
+
+
 def _label(name: str, names: Sequence[str], i: int) -> str:
-    """Name body `i` of a folder, or of an argument in Python."""
-    return f"{name}: {names[i]}" if len(names) else f"{name}[{i}]"
+    """Name body `i` of a folder, or of an argument in Python; `name` may be empty."""
+    return f"{name}[{i}]" if not len(names) else f"{name}: {names[i]}" if name else names[i]
 
 
 def _compare_edges(template: Mesh, bodies: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

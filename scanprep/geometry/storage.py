@@ -9,6 +9,7 @@ import dataclasses
 import json
 import math
 import os
+import secrets
 import stat
 import zipfile
 from collections.abc import Collection, Iterator, Mapping
@@ -114,6 +115,16 @@ def path_inside(folder: str | Path, name: object, source: str | Path) -> Path:
     return path
 
 
+def place_to_write(folder: str | Path, name: str, source: str | Path) -> Path:
+    """Return the place of a new file inside a folder, as `path_inside`; StorageError for a link on the way to it."""
+    path = path_inside(folder, name, source)
+    for place in list(path.parents)[:len(Path(name).parts) - 1]:
+        if place.is_symlink():
+            raise StorageError(f"{place}: expected a folder that {path.name} is written to, found a link; remove it, "
+                               "or name another output")
+    return path
+
+
 def read_bytes(path: str | Path, what: str = "a file", error: type[StorageError] = StorageError) -> bytes:
     """Read a whole file; raise `error` with its name on any problem."""
     check_regular(path, error, what)
@@ -129,15 +140,43 @@ def write_file(path: str | Path, data: bytes | str) -> None:
 
 @contextlib.contextmanager
 def writing(path: str | Path) -> Iterator[Path]:
-    """Yield a temporary path that replaces `path` when the block succeeds; until then the old file stays."""
+    """Yield a temporary file that replaces `path` when the block succeeds; until then the old file stays.
+
+    Folders come from strangers, with links in them. So the temporary file is new, under a name that nobody can guess,
+    and a link at `path` is replaced: what it leads to stays as it is.
+    """
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
-    beside = path.with_name(f".{path.stem}.{os.getpid()}.part{path.suffix}")
+    beside = path.with_name(f".{secrets.token_hex(8)}.part{path.suffix}")
     try:
+        create_file(beside)
         yield beside
         os.replace(beside, path)
+    except OSError as problem:           # a full disk names no file
+        if problem.filename not in (None, str(beside), beside):
+            raise
+        raise type(problem)(problem.errno, problem.strerror or str(problem), str(path)) from problem
     finally:
         beside.unlink(missing_ok=True)
+
+
+def create_file(path: str | Path, data: bytes = b"") -> None:
+    """Write a new file; FileExistsError where there is anything of that name, also a link that leads nowhere."""
+    flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_BINARY", 0)
+    with open(os.open(path, flags, 0o666), "wb") as file:
+        file.write(data)
+
+
+def keep_former(path: Path, ending: str = ".before") -> None:
+    """Copy a file beside itself before its first change; an earlier copy stays.
+
+    StorageError for a link in the place of the copy: a copy would overwrite what it leads to.
+    """
+    copy = path.with_name(path.name + ending)
+    if copy.is_symlink():
+        raise StorageError(f"{copy}: expected a copy of {path.name}, or nothing, found a link; remove it")
+    with contextlib.suppress(FileExistsError):
+        create_file(copy, read_bytes(path))
 
 
 def text(arrays: Mapping[str, np.ndarray], name: str, usual: str) -> str:

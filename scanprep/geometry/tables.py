@@ -7,6 +7,7 @@ import io
 import re
 from collections.abc import Iterable, Sequence
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -32,8 +33,8 @@ def read_table(path: str | Path, columns: Sequence[str], needed: Sequence[str] |
     return [(line, {**dict.fromkeys(columns, ""), **dict(zip(head, cells, strict=True))}) for line, cells in rows[1:]]
 
 
-# spreadsheets run this as a formula; with an apostrophe in front it is text
-_FORMULA = re.compile(r"'*[=+\-@]")
+# spreadsheets run this as a formula, or strip it and then do; with an apostrophe in front it is text
+_FORMULA = re.compile(r"'*(\s*[=+\-@]|[\t\r])")
 
 
 def _as_cell(value: Any) -> Any:
@@ -41,23 +42,29 @@ def _as_cell(value: Any) -> Any:
     if not isinstance(value, str) or not _FORMULA.match(value):
         return value
     with contextlib.suppress(ValueError):
-        float(value)                       # a number with a sign stays one
-        return value
+        if not value[0].isspace():
+            float(value)                   # a number with a sign stays one
+            return value
     return "'" + value
 
 
-def _of_cell(cell: str) -> str:
-    """Undo `_as_cell`."""
+def text_of_cell(cell: str) -> str:
+    """Return the text for which `csv_text` wrote a cell."""
     return cell[1:] if cell.startswith("'") and _FORMULA.match(cell) else cell
 
 
 def write_table(path: str | Path, header: Sequence[str], rows: Iterable[Sequence[Any]]) -> None:
     """Write a CSV table, atomically; `read_table` gives back the same text."""
-    text = io.StringIO()
-    table = csv.writer(text, lineterminator="\n")
-    table.writerow(header)
-    table.writerows(map(_as_cell, row) for row in rows)
-    write_file(path, text.getvalue())
+    write_file(path, csv_text([header, *rows]))
+
+
+def csv_text(rows: Iterable[Sequence[Any]]) -> str:
+    """Encode rows as CSV, with text that begins like a formula as text; `text_of_cell` undoes it."""
+    lines = list[str]()
+    # before Python 3.13 a carriage return is quoted only where it ends lines
+    out = SimpleNamespace(write=lambda line: lines.append(line.removesuffix("\r\n") + "\n"))
+    csv.writer(out, lineterminator="\r\n").writerows(map(_as_cell, row) for row in rows)
+    return "".join(lines)
 
 
 def number_lines(rows: np.ndarray, number: str = "%.6g", separator: str = ",") -> list[str]:
@@ -68,9 +75,7 @@ def number_lines(rows: np.ndarray, number: str = "%.6g", separator: str = ",") -
 
 def number_table(header: Sequence[str], rows: np.ndarray, number: str = "%.6g") -> str:
     """Format a CSV table of numbers (T, K), K at least 2: a heading and `number_lines`."""
-    text = io.StringIO()
-    csv.writer(text, lineterminator="\n").writerow(map(_as_cell, header))
-    return "\n".join([text.getvalue()[:-1], *number_lines(rows, number), ""])
+    return csv_text([header]) + "\n".join([*number_lines(rows, number), ""])
 
 
 def table_rows(path: str | Path, data: bytes, error: type[StorageError] = StorageError, separators: str = ",;\t"
@@ -84,7 +89,7 @@ def table_rows(path: str | Path, data: bytes, error: type[StorageError] = Storag
         text = decode_text(data)
         separator = max(separators, key=text.split("\n", 1)[0].count)
         reader = csv.reader(io.StringIO(text, newline=""), delimiter=separator)
-        rows = [(reader.line_num, [_of_cell(cell.strip()) for cell in cells]) for cells in reader]
+        rows = [(reader.line_num, [text_of_cell(cell.strip()) for cell in cells]) for cells in reader]
     width = 0
     for _, cells in rows:
         while len(cells) > width and not cells[-1]:

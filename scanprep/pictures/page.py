@@ -123,8 +123,11 @@ class Page:
     def chart(self, figure: Any, caption: str = "") -> Page:
         """Add a matplotlib figure as vector graphics; the same figure gives the same bytes."""
         from matplotlib import rc_context
+        from matplotlib.text import Text
 
         out = io.BytesIO()
+        for text in figure.findobj(Text):          # a name with two dollar signs is no formula
+            text.set_parse_math(False)
         # a fixed salt and no date, so that ids in the file do not change from run to run
         with rc_context({"svg.hashsalt": "scapekit"}):
             figure.savefig(out, format="svg", bbox_inches="tight", metadata={"Date": None})

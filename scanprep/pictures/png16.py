@@ -6,9 +6,10 @@ import zlib
 
 import numpy as np
 
+from ..geometry.images import check_pixels
+
 SIGNATURE = b"\x89PNG\r\n\x1a\n"
 CHANNELS = {0: 1, 2: 3, 4: 2, 6: 4}  # colour type of the PNG standard -> channels; a palette (3) has none
-MOST = 2**28                         # pixels: a small file could unpack to one that fills the memory
 
 
 def depth(data: bytes) -> tuple[int, int]:
@@ -24,8 +25,9 @@ def decode_png16(data: bytes) -> np.ndarray:
     width, height = struct.unpack(">II", data[16:24])
     if bits != 16 or not channels or data[28]:
         raise ValueError("expected 16 bits a channel, not interlaced")
-    if not 0 < width * height <= MOST:
-        raise ValueError(f"expected up to {MOST} pixels, got {width} x {height}")
+    if not width * height:
+        raise ValueError(f"expected pixels, got {width} x {height}")
+    check_pixels((width, height))
     # each row is one byte for its filter, then two bytes per channel, high byte first
     row = 1 + 2 * channels * width
     try:

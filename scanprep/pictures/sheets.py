@@ -7,7 +7,9 @@ from pathlib import Path
 
 import numpy as np
 
-from ..geometry.storage import read_bytes, write_file
+from ..geometry.images import open_image
+from ..geometry.storage import write_file
+from ..words import printable
 
 INK = (58, 62, 68)                   # colour of text: dark grey, softer than black
 
@@ -44,11 +46,11 @@ def contact_sheet(images: Sequence[np.ndarray], labels: Sequence[str] | None = N
         raise ValueError("images: expected at least one, got none")
     if labels is not None and len(labels) != len(images):
         raise ValueError(f"labels: expected {len(images)}, one for each image, got {len(labels)}")
-    columns = min(columns or len(images), len(images))
+    columns, labels = min(columns or len(images), len(images)), [printable(label) for label in labels or ()]
     # the widest picture or label sets the width of all cells, the highest picture of a row its height
     rows = -(-len(images) // columns)
     text = 24 if labels else 0
-    cell_w = max([*(i.shape[1] for i in images), *(int(font(15).getlength(label)) + 2 * gap for label in labels or ())])
+    cell_w = max([*(i.shape[1] for i in images), *(int(font(15).getlength(label)) + 2 * gap for label in labels)])
     heights = [max(len(i) for i in images[r * columns:(r + 1) * columns]) for r in range(rows)]
     tops = np.concatenate([[0], np.cumsum([h + text + gap for h in heights])])
     sheet = Image.new("RGB", (columns * (cell_w + gap) - gap, int(tops[-1]) - gap), "white")
@@ -83,9 +85,7 @@ def webp_bytes(image: np.ndarray) -> bytes:
 
 def small_picture(path: Path, width: int = 700) -> bytes:
     """Read a picture from a file and encode it as WebP, no wider than `width` pixels."""
-    from PIL import Image
-
-    with Image.open(io.BytesIO(read_bytes(path, "a picture"))) as image:
+    with open_image(path, "a picture") as image:
         image.thumbnail((width, width))
         return webp_bytes(np.asarray(image.convert("RGB")))
 

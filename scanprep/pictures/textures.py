@@ -3,9 +3,8 @@ from __future__ import annotations
 
 import base64
 import io
-import math
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -13,7 +12,7 @@ from typing import Any, Literal
 import numpy as np
 
 from ..geometry.budget import reading, spend
-from ..geometry.format_common import MeshFileError, load_bytes, metres_per_unit
+from ..geometry.format_common import MeshFileError, check_extent, load_bytes, metres_per_unit
 from ..geometry.format_glb import (
     WIDTHS,
     Glb,
@@ -25,6 +24,7 @@ from ..geometry.format_glb import (
     turn_up,
     up_of,
 )
+from ..geometry.images import check_pixels, open_image
 from ..geometry.mesh import Mesh
 from ..geometry.storage import check_regular, taking_apart, write_file
 from ..geometry.surface import Rays, barycentric
@@ -69,13 +69,6 @@ def bilinear(image: np.ndarray, uv: np.ndarray) -> np.ndarray:
     return values.reshape(len(uv), *image.shape[2:])
 
 
-def check_pixels(size: Sequence[int]) -> None:
-    """Raise ValueError for a picture of too many pixels: a small file may unpack to one that fills the memory."""
-    if math.prod(size) > 8192**2:            # the largest picture that scanners write; it takes 1.6 GB of memory
-        raise ValueError(f"{' x '.join(map(str, size))} pixels, expected at most 8192 x 8192")
-    spend(memory=8 * math.prod(size))        # a picture of 4096 x 4096 of one colour is within the budget of any mesh
-
-
 def read_texture(path: str | Path, unit: str | None = None) -> Texture | None:
     """Read the texture of an OBJ with its MTL, or of a GLB; None where the file has none.
 
@@ -102,6 +95,12 @@ def read_texture(path: str | Path, unit: str | None = None) -> Texture | None:
     word = {".obj": b"mtllib", ".glb": b'"images"'}.get(path.suffix.lower())
     if word is None or word not in load_bytes(path):
         return None
+    with taking_apart(path, "a mesh with a texture", MeshFileError):
+        return _texture_of(path, unit)
+
+
+def _texture_of(path: Path, unit: str | None) -> Texture | None:
+    """Read the texture of a file that names pictures; see `read_texture`."""
     loaded, found = load_with_materials(path, "load_mesh")
     problems = "; ".join(found.values())
     visual = loaded.visual
@@ -118,14 +117,14 @@ def read_texture(path: str | Path, unit: str | None = None) -> Texture | None:
         return None
     if problems:
         warnings.warn(f"{path}: some of its pictures cannot be read, what they show is grey ({problems})", stacklevel=2)
-    vertices = np.asarray(loaded.vertices, dtype=np.float64)
+    mesh = Mesh(np.asarray(loaded.vertices, dtype=np.float64), np.asarray(loaded.faces))
+    check_extent(path, "vertex", mesh.vertices)
     with warnings.catch_warnings():          # the reader of the mesh warns about the unit already
         warnings.simplefilter("ignore", UserWarning)
-        vertices = metres_per_unit(path, vertices, unit) * vertices
+        vertices = metres_per_unit(path, mesh.vertices, unit) * mesh.vertices
     if path.suffix.lower() == ".glb":
         vertices = vertices @ turn_up(up_of(chunks_of(path, load_bytes(path))[0]))
-    mesh = Mesh(vertices, np.asarray(loaded.faces))
-    return Texture(mesh, np.asarray(uv, dtype=np.float64), image)
+    return Texture(mesh.with_vertices(vertices), np.asarray(uv, dtype=np.float64), image)
 
 
 def load_with_materials(path: Path, function: Literal["load_mesh", "load_scene"]) -> tuple[Any, dict[str, str]]:
@@ -134,10 +133,13 @@ def load_with_materials(path: Path, function: Literal["load_mesh", "load_scene"]
     MeshFileError where the file cannot be read.
     """
     import trimesh
+    from PIL import Image
 
     resolver, ending = _beside(path), path.suffix[1:].lower()
     check_regular(path, MeshFileError)
-    with reading(path, MeshFileError), taking_apart(path, "a mesh with a texture", MeshFileError):
+    with reading(path, MeshFileError), taking_apart(path, "a mesh with a texture", MeshFileError), \
+            warnings.catch_warnings():
+        warnings.simplefilter("error", Image.DecompressionBombWarning)          # of pictures that trimesh opens
         data = load_bytes(path)
         if ending == "glb":
             _check_glb(path, data)
@@ -169,7 +171,6 @@ def _beside(path: Path) -> Any:
 
     Only files beside the mesh or below are read.
     """
-    from PIL import Image
     from trimesh.resolvers import Resolver
 
     class Beside(Resolver):
@@ -180,9 +181,10 @@ def _beside(path: Path) -> Any:
             try:
                 data = load_bytes(file_beside(path, name.strip()))
                 if not name.lower().endswith((".mtl", ".bin")):
-                    check_pixels(Image.open(io.BytesIO(data)).size)
+                    with open_image(name.strip(), "a picture", data) as image:
+                        image.load()
                 return data
-            except (OSError, ValueError, Image.DecompressionBombError) as problem:
+            except (OSError, ValueError) as problem:
                 self.problems[name.strip()] = " ".join(str(problem).split())
                 raise FileNotFoundError(name) from problem
 

@@ -86,7 +86,7 @@ def summarize(call: Call, count: int, prepared: Prepared, space: Workspace) -> O
             Metric("parts of the skeleton", len(tree.parents) if tree else "none sought"),
             *_quality(verdicts), Metric("unit assumed", call.config.scan.unit or "m")]
     return Outcome(space.folder, rows, {"prepare": call.config}, list(prepared.failures),
-                   judgement=judge_whole(verdicts, tree, parts=prepared.parts),
+                   judgement=judge_whole(verdicts, prepared.registered, parts=prepared.parts),
                    scans={verdict.name: verdict.judgement for verdict in verdicts},
                    following=f"open {quote(str(space.folder / 'report.html'))}, then "
                    f"scape learn --poses {quote(str(space.folder))} --shapes {quote(str(space.folder))} -o model.npz")
@@ -105,7 +105,7 @@ def page(registered: SetArg, limits: Limits = Limits()) -> Outcome:
     say(f"written: {registered / PAGE}")
     verdicts = judge_set(registered, limits)
     return Outcome(None, _quality(verdicts), {"limits": limits},
-                   judgement=judge_whole(verdicts, RegisteredSet.load(registered).skeleton, limits))
+                   judgement=judge_whole(verdicts, RegisteredSet.load(registered), limits))
 
 
 def _quality(verdicts: Sequence[Verdict]) -> list[Metric]:

@@ -50,6 +50,7 @@ class MendApp(ResultsApp):
 
     def __init__(self, folder: Path, ending: str = ".landmarks.json", names: tuple[str, ...] = ()) -> None:
         self.folder, self.call = folder, Call.read(folder)
+        self.outside = self.call.ask_outside(folder)
         if self.call.config.scan.through == "pose" or means_none(self.call.landmarks):
             raise ValueError(f"{folder}: it was made with --through pose or --landmarks none, which use none: "
                              "there are no landmarks to mend")

@@ -13,6 +13,7 @@ from scipy.sparse import eye_array
 from ..dataset import RegisteredSet, SetEntry
 from ..geometry import rotations
 from ..geometry.farthest_points import thin
+from ..geometry.members import find_several_people, measure_scales
 from ..geometry.mesh import Mesh
 from ..judgement import Judgement, judge_many
 from ..judgement import size as size_of
@@ -32,7 +33,6 @@ from ..registration.figures import (
 )
 from ..registration.nonrigid import Registration
 from ..skeleton.names import skeleton_doubts
-from ..skeleton.tree import Skeleton
 from ..words import number_of
 from .rivals import RIVALS, doubt_rivals
 
@@ -58,7 +58,7 @@ def write_set_page(folder: str | Path, limits: Limits | None = None, to: Path | 
     parts = [f"{failed} could not be registered"] * bool(failed) + [f"{suspect} need a look"] * bool(suspect)
     page = Page(f"Scans of {folder.absolute().name}",
                 f"{number_of(len(verdicts), 'scan')}: {', '.join(parts) or 'all within their limits'}.")
-    page.verdict(judge_whole(verdicts, registered.skeleton, limits))
+    page.verdict(judge_whole(verdicts, registered, limits))
     page.markup("", Path(__file__).with_name("page.css").read_text(encoding="utf-8"))
     page.table(_summary(verdicts), ("", "median", "worst", "unit"))
     page.section("Subjects", "Every scan, by subject: green is fine, amber needs a look, red could not be registered.")
@@ -99,9 +99,11 @@ def judge_set(folder: str | Path, limits: Limits | None = None) -> list[Verdict]
     return doubt_rivals(verdicts, folder, whole.entries)
 
 
-def judge_whole(verdicts: Sequence[Verdict], skeleton: Skeleton | None, limits: Limits | None = None,
+def judge_whole(verdicts: Sequence[Verdict], registered: RegisteredSet | None, limits: Limits | None = None,
                 parts: int | None = None) -> Judgement:
     """Judge a set: its scans, whether most of the surface has data, and the skeleton, which was to have `parts` parts.
+
+    Without a `registered` set, or one that has no skeleton, only the scans are judged.
 
     A gap that all scans share is no fault of one scan. Of twenty real people seen from the front 16 are good one by
     one, though in every second man one limb, unseen, is more than 45 mm off.
@@ -110,7 +112,11 @@ def judge_whole(verdicts: Sequence[Verdict], skeleton: Skeleton | None, limits: 
     usual, most = float(np.median(unseen)) if unseen else 0.0, UNSEEN + (limits or Limits()).unseen
     doubts = [f"{100 * usual:.0f}% of a body has no data in these scans: what is there is a guess"] if usual > most \
         else []
-    doubts += skeleton_doubts(skeleton, parts) if skeleton is not None else []
+    if registered is not None and registered.skeleton is not None:
+        # people who were taken for one are the cause of what their skeleton lacks
+        scales = measure_scales(registered.template, registered.poses())
+        doubts += find_several_people(scales, str(registered.folder))
+        doubts += skeleton_doubts(registered.skeleton, parts)
     return judge_many({verdict.name: verdict.judgement for verdict in verdicts}).merge(Judgement.of(check=doubts))
 
 

@@ -83,7 +83,7 @@ class Prepared:
     @property
     def judgement(self) -> Judgement:
         """The verdict on the whole set; `set.csv` and the page have that on each scan."""
-        return judge_whole(judge_set(self.registered.folder), self.registered.skeleton, parts=self.parts)
+        return judge_whole(judge_set(self.registered.folder), self.registered, parts=self.parts)
 
 
 def prepare(tasks: Sequence[ScanTask], template: Mesh, template_landmarks: Mapping[str, int], folder: str | Path,

@@ -5,10 +5,10 @@ import warnings
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from ..console import visible
 from ..geometry import storage, tables
 from ..geometry.files import SCAN_ENDINGS, MeshFileError, advice, is_scan, list_files, name_of
 from ..geometry.landmarks import landmarks_beside, names_no_landmark
+from ..words import printable
 
 TABLE = "scans.csv"               # optional table beside the scans
 ABOUT = {"digest": False}         # fields that only go into tables, so changing them registers nothing again
@@ -45,7 +45,7 @@ def find_scans(folder: str | Path, landmarks: str | Path | None = None, subject:
     paths: dict[str, Path] = {}
     for path in list_files(folder, is_scan):
         name = name_of(path)
-        if visible(name) != name or "\n" in name:            # names appear in tables, pages and messages
+        if printable(name) != name:            # names appear in tables, pages and messages
             raise ValueError(f"{folder}: expected names without control characters, found {path.name!a}; "
                              "rename it")
         if name in paths:
@@ -64,7 +64,9 @@ def find_scans(folder: str | Path, landmarks: str | Path | None = None, subject:
                          f"{', '.join(list(paths)[:5])}")
     if landmarks and not means_none(landmarks) and not Path(landmarks).is_dir():
         raise ValueError(f"landmarks: expected a folder, there is none at {landmarks}")
-    places = [folder / "landmarks", folder] if not landmarks else [] if means_none(landmarks) else [Path(landmarks)]
+    # what is clicked is written there, so a link that leads out of the folder has to be named
+    places = [storage.path_inside(folder, "landmarks", "--landmarks"), folder] if not landmarks else \
+        [] if means_none(landmarks) else [Path(landmarks)]
     # join each file with its row of the table and its landmark file
     tasks = []
     for name, path in sorted(paths.items()):

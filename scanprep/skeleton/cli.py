@@ -11,7 +11,7 @@ from ..cli import Output, Person, Unit, read_poses
 from ..console import Metric, Outcome, bar
 from ..dataset import RegisteredSet
 from ..geometry.files import read_mesh
-from ..geometry.members import find_spikes
+from ..geometry.members import ONE_BODY, find_doubtful_members
 from ..geometry.mesh import Mesh
 from ..judgement import Judgement
 from .edit import apply_edits, read_edits
@@ -52,7 +52,7 @@ def skeleton(poses: Annotated[Path, Place("POSES")], output: Output, template: P
                  f"{' and '.join(loop.parts)}, {'joined' if loop.joined else 'no longer linked'}")
           for loop in search.loops), *_shares(found, body)], {"skeleton": config},
                    judgement=Judgement.of(skeleton_problem(search, config.parts),
-                                          [*find_spikes(body, vertices, str(poses), names),
+                                          [*find_doubtful_members(body, vertices, str(poses), names, ONE_BODY),
                                            *skeleton_doubts(found, config.parts),
                                            *joint_doubts(found, joint_gaps(body, vertices, found).tolist())]))
 

@@ -200,6 +200,8 @@ def affine_weights(points: np.ndarray, target: np.ndarray) -> np.ndarray:
     """Compute weights (n,) nearest to equal that sum to 1 and average `points` (n, 3) to `target` (3,)."""
     n = len(points)
     scale = np.linalg.norm(points - points.mean(axis=0), axis=1).mean()
+    if not scale > 0:
+        raise ValueError("joints: expected vertices around each joint that are not all at one place")
     # least change from equal weights, subject to sum 1 and the weighted mean at the target
     A = np.vstack([np.ones(n), (points - points.mean(axis=0)).T / scale])
     b = np.r_[1.0, (target - points.mean(axis=0)) / scale]

@@ -2,7 +2,6 @@
 from __future__ import annotations
 
 import contextlib
-import shutil
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -15,6 +14,7 @@ from ..depth_camera.picture import is_picture, read_depth
 from ..geometry.files import UNITS, name_of, read_scan
 from ..geometry.landmarks import landmarks_beside, read_landmarks, write_landmarks
 from ..geometry.mesh import Mesh
+from ..geometry.storage import keep_former
 from ..geometry.surface import Surface
 from ..pictures.camera import Camera, guess_upright, outer_side
 from ..pictures.scene import Pane
@@ -22,7 +22,6 @@ from ..pictures.shading import CLAY, Dots, Shape, Solid
 from ..pictures.thinning import thin_solid
 from .surface_clicks import Clickable
 
-KEPT = ".before"                     # ending of the backup of a landmark file, made before its first change
 MOST_ASIDE = 60                      # degrees from the middle of its outside, at which a one-sided scan is shown first
 
 Places = dict[str, np.ndarray]
@@ -75,9 +74,8 @@ class Clicked:
 
     def save(self) -> None:
         """Write all landmarks, or remove the file when there are none; a file from before is backed up once."""
-        backup = self.file.with_name(self.file.name + KEPT)
-        if self.file.exists() and not self._saved and not backup.exists():
-            shutil.copyfile(self.file, backup)
+        if self.file.exists() and not self._saved:
+            keep_former(self.file)
         self._saved, self._order = True, tuple(dict.fromkeys([*self._order, *self.places]))
         if self.places:
             write_landmarks(self.file, {name: self.places[name] for name in self._order if name in self.places},

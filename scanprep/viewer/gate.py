@@ -66,8 +66,8 @@ def file_name(name: str) -> str:
     last = re.sub(r"[^\w .()+-]", "_", last).strip(" ")
     if not last.strip(". "):
         raise ValueError("name: expected the name of a file")
-    longest_name = 120  # characters of the name of a stored file
-    return last if len(last) <= longest_name else last[-longest_name:].lstrip(" ")
+    longest_name = 120  # bytes of the name of a stored file; the ending stays
+    return last.encode()[-longest_name:].decode(errors="ignore").lstrip(" ")
 
 
 def file_inside(folders: Iterable[Path], name: str) -> Path:

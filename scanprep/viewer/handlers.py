@@ -218,8 +218,11 @@ class Drop(Guarded):
         if expected > LARGEST_FILE:
             raise RefusedError(413, self.TOO_LARGE)
         self.request.connection.set_max_body_size(LARGEST_FILE + PIECE)     # type: ignore[union-attr]
-        self.folder = Path(tempfile.mkdtemp(dir=self.server.dropped))
-        self.out = open(self.folder / self.name, "wb")
+        try:
+            self.folder = Path(tempfile.mkdtemp(dir=self.server.dropped))
+            self.out = open(self.folder / self.name, "wb")
+        except OSError as problem:
+            raise RefusedError(507, f"cannot store the file: {problem.strerror}") from None
         self.size = 0
 
     def data_received(self, chunk: bytes) -> None:

@@ -17,7 +17,7 @@ from ..skeleton.symmetry import MirrorPlane, find_symmetry
 from .app import Send
 from .clicked import Clicked
 from .landmark_names import AIMS
-from .pick import TEMPLATE, PickApp
+from .pick import TEMPLATE, PickApp, as_direction, as_point
 from .surface_clicks import Clickable
 
 
@@ -72,7 +72,7 @@ class JointApp(PickApp):
                  inside: bool = False, seen: list[float] | None = None, drag: int = 0) -> None:
         """Place a joint half way through the body or a point on it, and propose that of the other side."""
         body, joint = self.template, name not in self.on_surface
-        ray = np.array(origin, dtype=float), np.array(direction, dtype=float)
+        ray = as_point(origin), as_direction(direction)
         stretch = body.body.interval(*ray) if joint else None
         if joint and stretch is None:
             self.note = "the click meets no body with a front and a back: turn it, or click beside the place"

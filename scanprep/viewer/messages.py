@@ -6,14 +6,19 @@
 """
 from __future__ import annotations
 
+import inspect
 import json
 import struct
-from collections.abc import Mapping
+import typing
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from types import NoneType, UnionType
 from typing import Any
 
 from ..geometry import storage
+from ..geometry.format_common import FARTHEST
 
+LONGEST = 4096                       # characters of a text: paths have as many
 # keys of a header and their types
 KEYS = {"kind": str, "latest": str, "number": int, "fields": dict}
 
@@ -80,3 +85,43 @@ def _check(header: Any) -> None:
             raise ValueError(f"message: {key}: expected {kind.__name__}, got {type(header[key]).__name__}")
     if not header["kind"] or header["number"] < 0:
         raise ValueError("message: expected a kind and a number that is not negative")
+
+
+def find_action(app: object, kind: str) -> Callable[..., Any]:
+    """Return the method of an app that answers messages of a kind; ValueError where there is none."""
+    action = getattr(app, f"on_{kind}", None)
+    if not inspect.ismethod(action) or next(iter(inspect.signature(action).parameters), "") != "send":
+        raise ValueError(f"a message of kind '{kind[:80]}', which nothing here answers")
+    return action
+
+
+def call_action(action: Callable[..., Any], fields: Mapping[str, Any], *given: object) -> Any:
+    """Call a function with what is given first, then with the fields of a message as arguments.
+
+    ValueError for fields that the function does not take, or that are not of the type in its signature.
+    """
+    fields, hints = storage.as_json(dict(fields)), typing.get_type_hints(action)
+    parameters = list(inspect.signature(action).parameters.values())[len(given):]
+    needed = {each.name for each in parameters if each.default is each.empty}
+    if not needed <= set(fields) <= {each.name for each in parameters}:
+        raise ValueError(f"message: expected fields among {', '.join(each.name for each in parameters) or 'none'}, "
+                         f"got {', '.join(fields)[:200] or 'none'}")
+    for name, value in fields.items():
+        if not _fits(value, hints[name]):
+            wanted = getattr(hints[name], "__name__", str(hints[name]))
+            raise ValueError(f"message: {name}: expected {wanted}, got {json.dumps(value)[:80]}")
+    return action(*given, **fields)
+
+
+def _fits(value: Any, hint: Any) -> bool:
+    """Test whether a value from JSON has a type: a text, a flag, a number, None, a list of these, or one of several."""
+    inner = typing.get_args(hint)
+    if isinstance(hint, UnionType):
+        return any(_fits(value, each) for each in inner)
+    if typing.get_origin(hint) is list:
+        return type(value) is list and all(_fits(each, inner[0]) for each in value)
+    if hint is float:
+        return type(value) in (int, float) and abs(value) <= FARTHEST
+    if hint is int:
+        return type(value) is int and abs(value) < 2**53             # what JavaScript counts exactly
+    return type(value) is hint and (hint is not str or len(value) <= LONGEST) and hint in (str, bool, NoneType)

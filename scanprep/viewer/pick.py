@@ -25,7 +25,7 @@ from ..words import number_of
 from .app import Send
 from .clicked import Clicked, Places, camera_like, camera_of, predict_landmarks
 from .landmark_names import next_name
-from .messages import Message
+from .messages import Message, call_action, find_action
 from .worker import Stopped
 
 TEMPLATE, SCAN = 0, 1                # numbers of the panes on the page
@@ -142,13 +142,11 @@ class PickApp:
 
     def handle(self, message: Message, send: Send) -> None:
         """Act on a click, key or button; every change is saved before the page gets the new state."""
-        action = getattr(self, f"on_{message.kind}", None)
-        if action is None:
-            raise ValueError(f"a message of kind '{message.kind}', which nothing here answers")
+        action = find_action(self, message.kind)
         with self._lock:
             self.note, self.question = "", None
             self.depth = self.depth if message.kind == "slide" else None
-            action(send, **message.fields)
+            call_action(action, message.fields, send)
         send(self.state())
 
     def receive(self, name: str, path: Path, send: Send) -> None:
@@ -170,10 +168,10 @@ class PickApp:
             # second click on the same pane: it is for the next name
             offered = self.names if pane == TEMPLATE or self.building else self._of_template()
             name = next_name(offered, set(clicked.places), name) or name
-        body, ray = clicked.body, (_point(origin), _point(direction))
+        body, ray = clicked.body, (as_point(origin), as_direction(direction))
         place = body.middle(*ray) if inside else body.hit(*ray)
         if place is None and seen is not None:       # the page draws a simplified surface: only that was hit
-            place = body.nearest(_point(seen))
+            place = body.nearest(as_point(seen))
         if place is None:
             self.note = "the click met nothing: turn the body so that the place faces you"
             return
@@ -199,8 +197,10 @@ class PickApp:
 
     def on_slide(self, send: Send, pane: int, name: str, direction: list[float], by: float) -> None:
         """Move a landmark along a ray by `by` metres: into the body, to where a joint is."""
-        along = _point(direction)
-        place = self._editable(pane).places[name] + by * along / np.linalg.norm(along)
+        places = self._editable(pane).places
+        if name not in places:
+            raise ValueError(f"name: expected a landmark that was clicked, got {name}")
+        place = places[name] + by * as_direction(direction)
         self._change(self._number(pane), {name: place}, -1)         # -1: consecutive keystrokes are undone together
 
     def on_remove(self, send: Send, pane: int, name: str) -> None:
@@ -403,9 +403,18 @@ def _lists(places: Places) -> dict[str, list[float]]:
     return {name: place.tolist() for name, place in places.items()}
 
 
-def _point(values: Any) -> np.ndarray:
+def as_point(values: Any) -> np.ndarray:
     """Return three finite numbers as a point; ValueError for anything else."""
     point = np.asarray(values, dtype=float)
     if point.shape != (3,) or not np.isfinite(point).all():
         raise ValueError(f"expected three finite numbers, got {values}")
     return point
+
+
+def as_direction(values: Any) -> np.ndarray:
+    """Return three finite numbers as a unit vector; ValueError for anything else."""
+    along = as_point(values)
+    length = np.linalg.norm(along)
+    if not length > 0:
+        raise ValueError(f"direction: expected other than zero, got {values}")
+    return np.asarray(along / length)

@@ -12,6 +12,7 @@ from ..batch.workspace import Workspace
 from ..console import Outcome, keep_report
 from ..judgement import Judgement
 from .app import Send
+from .messages import Message
 from .pick import PickApp
 
 
@@ -23,6 +24,7 @@ class ResultsApp(PickApp):
 
     folder: Path                # of the results
     no_result = "not done yet"  # shown for a body without result
+    outside = ""                # question about files outside of the folder, until the page has shown it
 
     def judgements(self) -> Iterable[Judgement | None]:
         """Yield the judgement on every body in order; None for one without result."""
@@ -35,6 +37,13 @@ class ResultsApp(PickApp):
     def show_results(self, results: Any) -> None:
         """Show results that were read."""
         raise NotImplementedError
+
+    def handle(self, message: Message, send: Send) -> None:
+        """Act on a message; the first that could change a file outside of the folder is refused with a question."""
+        if self.outside and message.kind not in ("open", "choose", "frame"):
+            question, self.outside = self.outside, ""
+            raise ValueError(question)
+        super().handle(message, send)
 
     def more(self) -> dict[str, Any]:
         """Add the judgements to the state."""

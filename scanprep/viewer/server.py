@@ -206,7 +206,8 @@ def serve(app: App, port: int | None = None, open_browser: bool = True, say: Cal
     """
     remote = "SSH_CONNECTION" in os.environ
     with contextlib.suppress(KeyboardInterrupt), terminate_as_interrupt(), Server(app, port, say) as server:
-        say(f"{one_line(app.title)}: {server.address}\nCtrl-C ends it")
+        say(f"{one_line(app.title)}: {server.address}")
+        say("Ctrl-C ends it")
         if remote or not open_browser:
             say(f"from another machine: ssh -N -L {server.port}:{ADDRESS}:{server.port} {socket.gethostname()}")
         elif _has_screen():

@@ -17,6 +17,7 @@ from scanprep.geometry import storage, tables
 from scanprep.pictures.camera import stance
 from scanprep.skeleton.roles import find_numbered_roles
 from scanprep.skeleton.tree import Skeleton
+from scanprep.words import printable
 
 from ...motion import Motion
 from ..joint_angles import NOTHING_KNOWN, JointAngles, Known, anatomical_angles, ground_axes
@@ -119,7 +120,8 @@ def write_mot(path: str | Path, angles: JointAngles, rate: float) -> None:
 
 def write_storage(path: str | Path, names: Sequence[str], table: np.ndarray, remarks: Sequence[str]) -> None:
     """Write columns (T, K) as a Storage file of OpenSim, with remarks in its header."""
-    lines = [Path(path).stem, "version=1", f"nRows={len(table)}", f"nColumns={len(names)}", "inDegrees=yes", "",
-             *remarks, "", "endheader", "\t".join(names), *tables.number_lines(table, "%.8g", "\t")]
+    lines = [printable(Path(path).stem), "version=1", f"nRows={len(table)}", f"nColumns={len(names)}",
+             "inDegrees=yes", "", *remarks, "", "endheader", "\t".join(names),
+             *tables.number_lines(table, "%.8g", "\t")]
     with storage.writing(Path(path)) as beside:
         beside.write_text("\n".join(lines) + "\n", encoding="utf-8", newline="\n")

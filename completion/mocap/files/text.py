@@ -16,7 +16,7 @@ import numpy as np
 
 from scanprep.geometry import tables
 from scanprep.geometry.storage import StorageError
-from scanprep.words import number_of
+from scanprep.words import number_of, printable
 
 Rows = Sequence[tuple[int, Sequence[str]]]           # number and cells of each line of a table
 
@@ -144,7 +144,7 @@ def encode_trc(positions: np.ndarray, labels: Sequence[str], rate: float, name: 
     """
     spelled = [re.sub(r"\s+", "_", label.strip()) or f"marker{i + 1}" for i, label in enumerate(labels)]
     T, L = positions.shape[:2]
-    lines = [f"PathFileType\t4\t(X/Y/Z)\t{name}",
+    lines = [f"PathFileType\t4\t(X/Y/Z)\t{printable(name)}",
              "DataRate\tCameraRate\tNumFrames\tNumMarkers\tUnits\tOrigDataRate\tOrigDataStartFrame\tOrigNumFrames",
              f"{rate:.9g}\t{rate:.9g}\t{T}\t{L}\tmm\t{rate:.9g}\t1\t{T}",
              "Frame#\tTime\t" + "\t\t\t".join(spelled) + "\t\t",

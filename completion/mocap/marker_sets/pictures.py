@@ -13,6 +13,7 @@ from scanprep.pictures.scene import Pane
 from scanprep.pictures.shading import Dots, Solid, contact_sheet, render
 from scanprep.pictures.sheets import font, webp_bytes
 from scanprep.skeleton.tree import Skeleton
+from scanprep.words import printable
 
 from .layout import MarkerLayout
 from .symmetry import label_pairs
@@ -31,6 +32,7 @@ def picture_layout(body: Mesh, layout: MarkerLayout, height: int | None = None) 
     cameras, height, images = look_around(body), height or HEIGHT, []
     width, size = int(height * max(c.width / c.height for c in cameras)) + 100, font(12)
     points, radius = layout.place(body), 0.0055 * float(np.ptp(body.vertices, axis=0).max())
+    labels = [printable(label) for label in layout.labels]
     colors = np.array([LOOSE if label in layout.loose else FIXED for label in layout.labels])
     for camera in cameras:
         image = Image.fromarray(render([Solid(body), Dots(points, colors, radius)], camera, width, height))
@@ -44,7 +46,7 @@ def picture_layout(body: Mesh, layout: MarkerLayout, height: int | None = None) 
         for i in np.argsort(places[:, 1]):
             if hidden[i]:
                 continue
-            wide, (x, y) = draw.textlength(layout.labels[i], font=size), places[i]
+            wide, (x, y) = draw.textlength(labels[i], font=size), places[i]
             boxes = [(a, b, a + wide, b + 13) for a, b in (
                 (x + 7, y - 7), (x - 7 - wide, y - 7), (x + 5, y - 20), (x + 5, y + 6), (x - 5 - wide, y - 20),
                 (x - 5 - wide, y + 6))]
@@ -52,7 +54,7 @@ def picture_layout(body: Mesh, layout: MarkerLayout, height: int | None = None) 
                 box[0] < other[2] and other[0] < box[2] and box[1] < other[3] and other[1] < box[3]
                 for other in taken)]
             taken.append((free or boxes)[0])
-            draw.text(taken[-1][:2], layout.labels[i], fill=(24, 40, 92), font=size)
+            draw.text(taken[-1][:2], labels[i], fill=(24, 40, 92), font=size)
         images.append(np.asarray(image))
     return contact_sheet(images, ("front", "its left", "back", "its right"))
 

@@ -77,6 +77,7 @@ class MoshApp(ResultsApp):
         self.before: dict[str, list[Metric]] = {}
         self._begin_with(self.read_results())
         super().__init__(self.template, self.scans, (), fixed=self.template.places)
+        self.outside = self.result.call.ask_outside(folder)
 
     def read_results(self) -> Result:
         """Read what the folder holds now, for the last call."""

@@ -17,9 +17,9 @@ from typing import Any
 
 import numpy as np
 
+from scanprep.geometry.images import check_pixels, open_image
 from scanprep.geometry.storage import StorageError, read_bytes, read_json, taking_apart, write_json, writing
 from scanprep.pictures import png16
-from scanprep.pictures.textures import check_pixels
 
 from ..control.model import FOLDED, HOLE, MEASURED, OUTSIDE, DisplacementMap
 
@@ -119,13 +119,10 @@ def _read(path: Path, size: tuple[int, ...], kind: Any) -> np.ndarray:
 
 def _decode_image(path: Path) -> tuple[np.ndarray, int]:
     """Decode an image file; return the pixels and the bits per channel."""
-    from PIL import Image
-
     data = read_bytes(path, "an image")
     if data[:8] == png16.SIGNATURE and png16.depth(data) in ((16, 2), (16, 3), (16, 4)):
         return png16.decode_png16(data), 16
-    with Image.open(io.BytesIO(data)) as image:
-        check_pixels(image.size)
+    with open_image(path, "an image", data) as image:
         if image.mode.startswith("I;16") or (image.mode == "I" and image.format == "PNG"):
             return np.asarray(image).astype(np.uint16), 16
         return np.asarray(image), 32 if image.mode in ("I", "F") else 8
