@@ -6,6 +6,7 @@ import warnings
 
 import numpy as np
 import pytest
+from fuzz_bombs import pictured_glb, png
 from mesh_files import TETRAHEDRON, quiet, refused
 from PIL import Image
 from scipy.spatial.transform import Rotation
@@ -392,6 +393,18 @@ def test_pictures_that_are_none_or_too_large_are_named(tmp_path, what):
             "outside": "expected the name of a file inside", "huge": "8200 x 8200 pixels"}[what]
     with pytest.warns(UserWarning, match=says):
         read_texture(obj)
+
+
+@pytest.mark.parametrize(("picture", "says"), [(b"\xabKTX 20\xbb of another program", "its colours are left out"),
+                                               (png(9000, 9000), "9000 x 9000 pixels")])
+def test_a_picture_in_a_glb_that_cannot_be_read_is_named(tmp_path, picture, says):
+    (tmp_path / "a.glb").write_bytes(pictured_glb(picture))
+    if says.startswith("its"):
+        with pytest.warns(UserWarning, match=says):
+            assert read_texture(tmp_path / "a.glb") is None
+    else:
+        with pytest.raises(ValueError, match=rf"a\.glb.*{says}"):
+            read_texture(tmp_path / "a.glb")
 
 
 def test_all_good_pictures_are_read_without_a_word(tmp_path):
