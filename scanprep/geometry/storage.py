@@ -18,6 +18,7 @@ from typing import IO, Any
 
 import numpy as np
 
+from ..words import printable
 from .budget import memory_for
 
 HEADER = "header"
@@ -26,7 +27,13 @@ LARGEST_TEXT = 2**28                 # bytes: larger JSON files and tables are r
 
 
 class StorageError(ValueError):
-    """A missing or damaged file, or one of another kind or version; names the file, what was expected and what came."""
+    """A missing or damaged file, or one of another kind or version; names the file, what was expected and what came.
+
+    The message is one line, whatever stands in the file.
+    """
+
+    def __init__(self, message: str = "") -> None:
+        super().__init__(printable(message))
 
 
 class ObjectsError(ValueError):

@@ -25,8 +25,8 @@ def read_table(path: str | Path, columns: Sequence[str], needed: Sequence[str] |
     _, rows = table_rows(path, read_bytes(path, f"a table with the columns {','.join(columns)}"))
     head = rows[0][1] if rows else []
     if not set(columns if needed is None else needed) <= set(head) or len(set(head)) < len(head):
-        found = repr(",".join(head)[:80]) if head else "an empty file"       # a cell may hold line ends
-        raise StorageError(f"{path}: line 1: expected the columns {','.join(columns)}, each once, found {found}")
+        raise StorageError(f"{path}: line 1: expected the columns {','.join(columns)}, each once, "
+                           f"found {','.join(head)[:80] or 'an empty file'}")
     for line, cells in rows:
         if len(cells) != len(head):
             raise StorageError(f"{path}: line {line}: expected {len(head)} values, found {len(cells)}")
