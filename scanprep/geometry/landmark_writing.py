@@ -89,7 +89,8 @@ def _marker_set(points: Points, unit: str | None) -> str:
 def marker_set(markers: Mapping[str, tuple[str, np.ndarray]]) -> str:
     """Encode a marker set of OpenSim 4: name -> path of the frame, as `/bodyset/pelvis`, and position (3,), metres."""
     rows = "".join(
-        f"   <Marker name={quoteattr(_visible(name))}>\n    <socket_parent_frame>{escape(frame)}</socket_parent_frame>\n"
+        f"   <Marker name={quoteattr(_visible(name))}>\n"
+        f"    <socket_parent_frame>{escape(frame)}</socket_parent_frame>\n"
         f"    <location>{' '.join(map(repr, map(float, place)))}</location>\n    <fixed>false</fixed>\n   </Marker>\n"
         for name, (frame, place) in markers.items())
     return ('<?xml version="1.0" encoding="UTF-8" ?>\n'
