@@ -276,6 +276,16 @@ def table_bombs() -> Iterator[tuple[str, bytes]]:
                     b"OFFSET 0 1 0\n}\n}\nMOTION\nFrames: 999999999999\nFrame Time: 0.01\n0 0 0\n")
 
 
+def xml_bombs() -> Iterator[bytes]:
+    """Entities of entities, one long entity, and elements without end, as landmarks of MeshLab and OpenSim."""
+    nine = "".join(f'<!ENTITY a{i + 1} "{f"&a{i};" * 10}">' for i in range(9))
+    point = b'<point x="0" y="0" z="0" name="%s"/>'
+    yield from (b"<!DOCTYPE a [<!ENTITY a0 'ha'>" + nine.encode() + b"]><a>" + point % b"&a9;" + b"</a>",
+                 b"<!DOCTYPE a [<!ENTITY b '" + b"ha" * 50_000 + b"'>]><a>" + point % (b"&b;" * 20_000) + b"</a>",
+                 b"<!DOCTYPE a [<!ENTITY b SYSTEM 'file:///etc/passwd'>]><a>" + point % b"&b;" + b"</a>",
+                 b"<a>" * 200_000, b"<a>" * 100_000 + b"</a>" * 100_000, b"<a>" + point % b"x" * 50_000 + b"</a>")
+
+
 def c3d_bombs() -> Iterator[bytes]:
     """Headers that say more points, frames and analogue samples than the file has; parameters over each other."""
     for points, analogue, first, last, scale in ((65535, 65535, 1, 65535, -1.0), (65535, 0, 1, 65535, 0.1),
@@ -325,6 +335,9 @@ def make_bombs() -> Iterator[Bomb]:
     for data in json_bombs():
         for read in (Skeleton.load, MarkerLayout.load, lambda path: read_landmarks(path, np.zeros((3, 3)))):
             yield "a.json", read, data
+    for data in xml_bombs():
+        for name in ("a.pp", "a.xml"):
+            yield name, lambda path: read_landmarks(path, np.zeros((3, 3))), data
     for name, data in table_bombs():
         yield name, (lambda path: read_bvh(path, "m")) if "bvh" in name else read_markers, data
     for data in c3d_bombs():

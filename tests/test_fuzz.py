@@ -43,6 +43,16 @@ def test_damaged_files_of_every_kind():
     assert told["read"] > int(count) // 20 and told["refused"] > int(count) // 2        # it does damage, and not all
 
 
+@pytest.mark.slow
+@pytest.mark.timeout(1800)
+def test_bombs_of_every_kind():
+    ran = subprocess.run([sys.executable, Path(__file__).with_name("fuzz_bombs.py")], capture_output=True, text=True,
+                         check=False)
+    told = json.loads(ran.stdout.splitlines()[-1]) if ran.stdout else {}
+    assert ran.returncode == 0, ran.stdout[-5000:] + ran.stderr[-5000:]
+    assert told["failed"] == 0 and told["refused"] > 100
+
+
 def glb(tree, binary):
     text = json.dumps(tree).encode()
     text += b" " * (-len(text) % 4)

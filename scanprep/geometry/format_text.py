@@ -196,10 +196,11 @@ def read_xyz(path: Path, data: bytes) -> Contents:
     table = lines.table(range(first, len(lines)), "numbers 'x y z', as many on every line", 3)
     if names:
         return _columns_by_name(lines, names, table)
-    # find normals and colours among the columns from `start` on; skip columns that begin neither
+    # find normals and colours among the columns from `start` on; skip columns that begin neither. No program writes
+    # more than some twenty
     start = 4 if path.name.lower().endswith(".pts") and table.shape[1] in (4, 7) else 3
     normals = colors = None
-    while start + 3 <= table.shape[1]:
+    while start + 3 <= min(table.shape[1], 64):
         triple = table[:, start:start + 3]
         if normals is None and np.allclose(np.linalg.norm(triple, axis=1), 1, atol=1e-2):
             normals, start = triple, start + 3
