@@ -178,13 +178,9 @@ class RegisteredSet:
             mesh = self.template.with_vertices(mesh)
         check_same_topology(Path(name), mesh, self.folder / "template.ply", self.template)
         entry = SetEntry(name, subject, pose, sex, f"meshes/{name}.ply")
-<<<<<<< HEAD
-        write_mesh(storage.place_to_write(self.folder, entry.file, self.folder), replace(mesh, attached=None))
-=======
->>>>>>> h59_small
         rows = {row.name: row for row in read_entries(self.folder)}
         check_names([*rows, name], str(self.folder))
-        write_mesh(self.folder / entry.file, replace(mesh, attached=None))
+        write_mesh(storage.place_to_write(self.folder, entry.file, self.folder), replace(mesh, attached=None))
         rows[name] = entry                               # replaces an entry of the same name in its place
         _write_rows(self.folder, rows.values())
         return replace(self, entries=tuple(rows.values()))
