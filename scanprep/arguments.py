@@ -298,12 +298,18 @@ def read_line(prog: str, text: str, arguments: Sequence[Argument], argv: Sequenc
         An unknown flag, with the most similar one; missing arguments, all of them; a value of another type.
     """
     parser = make_parser(prog, text, arguments)
+    # behind -- there are files only, whatever they are called
+    if "--" in argv:
+        end = list(argv).index("--")
+        argv = [*argv[:end], *(f"./{word}" if word.startswith("-") else word for word in argv[end + 1:])]
     values, unknown = parser.parse_known_intermixed_args(_join_flag_values(argv, arguments))
     # complain about the first unknown flag rather than about the value behind it
     if unknown:
         word = next((word for word in unknown if word.startswith("-")), unknown[0])
         if not word.startswith("-"):
             raise UsageError(f"{word}: one argument too many")
+        if Path(word).exists():
+            raise UsageError(f"{word}: no such flag; for the file of this name write ./{word}")
         word = word.partition("=")[0]
         raise UsageError(f"{word}: no such flag{near(word, (flag for a in arguments for flag in a.flags))}")
     missing = [a.flag for a in arguments if a.required and getattr(values, a.name, None) in (None, [])]

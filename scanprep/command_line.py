@@ -23,7 +23,7 @@ from .config_files import Flag
 from .console import JUDGEMENT, Metric, Outcome, keep_report, say, show, write_report
 from .interrupts import terminate_as_interrupt, tidy_up
 from .threads import one_thread
-from .words import OUR_MODULES
+from .words import OUR_MODULES, explain_os_error
 
 SPACE, FORCE = "space", "force"        # parameters that every command handles the same way
 TRACEBACK = "SCAPEKIT_TRACEBACK"       # environment variable that shows the traceback of an error
@@ -308,7 +308,9 @@ def _error_line(error: Exception, call: _Call | None) -> str:
     if isinstance(error, MemoryError):
         fewer = ", or --workers 1" if call and any(each.flag == "--workers" for each in call.arguments.listed) else ""
         return f"there is too little memory{': ' + text if text else ''}; give fewer triangles{fewer}"
-    if isinstance(error, ValueError | OSError | ModuleNotFoundError):
+    if isinstance(error, OSError):
+        return explain_os_error(error, "the file" if call is None or call.output is None else call.output)
+    if isinstance(error, ValueError | ModuleNotFoundError):
         return text
     return f"unforeseen {type(error).__name__}: {text} (this is a fault of scapekit; {TRACEBACK}=1 shows where)"
 

@@ -13,6 +13,7 @@ from .geometry import storage, tables
 from .geometry.files import MeshFileError, check_same_topology, read_mesh, write_mesh
 from .geometry.mesh import Mesh
 from .skeleton.tree import Skeleton
+from .words import check_names
 
 # version and kind in the header, `set.json`: files of another version are refused
 VERSION = 1
@@ -177,8 +178,9 @@ class RegisteredSet:
             mesh = self.template.with_vertices(mesh)
         check_same_topology(Path(name), mesh, self.folder / "template.ply", self.template)
         entry = SetEntry(name, subject, pose, sex, f"meshes/{name}.ply")
-        write_mesh(storage.place_to_write(self.folder, entry.file, self.folder), replace(mesh, attached=None))
         rows = {row.name: row for row in read_entries(self.folder)}
+        check_names([*rows, name], str(self.folder))
+        write_mesh(storage.place_to_write(self.folder, entry.file, self.folder), replace(mesh, attached=None))
         rows[name] = entry                               # replaces an entry of the same name in its place
         _write_rows(self.folder, rows.values())
         return replace(self, entries=tuple(rows.values()))

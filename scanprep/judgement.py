@@ -68,6 +68,11 @@ class Judgement:
         return Judgement.of([reason for one in every for reason in one.problems],
                             [reason for one in every for reason in one.doubts])
 
+    def put_first(self, cause: str | None) -> Judgement:
+        """Put the cause of a judgement before its other reasons: at least `check`; None changes nothing."""
+        causes = [] if cause is None else [cause]
+        return Judgement.of(causes if self.problems else [], causes).merge(self)
+
     def __str__(self) -> str:
         return f"{self.verdict}: {self.why}" if self.reasons else self.verdict
 

@@ -1,7 +1,9 @@
 """Texts of messages for users: numbers with nouns, and the modules whose warnings are shown."""
 from __future__ import annotations
 
+import errno
 import unicodedata
+from collections.abc import Iterable
 from dataclasses import fields
 from typing import Any
 
@@ -30,6 +32,47 @@ def printable(text: str) -> str:
     # Unicode categories: control, format (also writing direction), surrogates, separators
     return "".join(c.encode("unicode_escape", "surrogatepass").decode("ascii")
                    if unicodedata.category(c) in {"Cc", "Cf", "Cs", "Zl", "Zp"} else c for c in text)
+
+
+def explain_os_error(error: OSError, place: object) -> str:
+    """Say in a line which file the system could not read or write, and why; `place` is named where it tells no file.
+
+    Examples
+    --------
+    >>> explain_os_error(OSError(28, "No space left on device"), "out.ply")
+    'out.ply: the disk is full; make room there, then run the same command again'
+    """
+    if error.strerror is None:                     # made by our code or a library, with a text of its own
+        return " ".join(str(error).split())
+    full = error.errno in (errno.ENOSPC, getattr(errno, "EDQUOT", None))
+    reason = "the disk is full; make room there, then run the same command again" if full else error.strerror
+    return f"{error.filename or place}: {reason}"
+
+
+def fold_name(name: str) -> str:
+    """Return the form that names share which are one file or folder on some disks, those of Windows and macOS.
+
+    Examples
+    --------
+    >>> fold_name("Ann\\u00e9") == fold_name("anne\\u0301")
+    True
+    """
+    return unicodedata.normalize("NFC", unicodedata.normalize("NFC", name).casefold())
+
+
+def check_names(names: Iterable[str], source: str) -> None:
+    """Raise ValueError for names that cannot all be files beside each other on every disk; `source` says whose."""
+    known = dict[str, str]()
+    for name in names:
+        if printable(name) != name:                # names appear in tables, pages and messages
+            raise ValueError(f"{source}: expected names without control characters, found {name!a}; rename it")
+        # most disks take 255 bytes; names of records and temporary files are longer
+        if len(name.encode()) > 200:
+            raise ValueError(f"{source}: expected names of at most 200 bytes, found {name[:40]}... of "
+                             f"{len(name.encode())}; rename it")
+        if (other := known.setdefault(fold_name(name), name)) != name:
+            raise ValueError(f"{source}: '{other}' and '{name}' are one name on the disks of Windows and macOS; "
+                             "rename one")
 
 
 def describe_result(result: Any) -> str:

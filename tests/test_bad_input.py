@@ -183,3 +183,35 @@ def test_the_good_files_are_good(place, capsys):
             "joint_angles.csv", "joint_centres.csv", "residuals.csv",
             "subject.json", "layout.json",
             "report.html", "report.json"} == {p.name for p in (place / "out2").glob("[!.]*")}
+
+
+FULL, GONE = OSError(28, "No space left on device"), OSError(5, "Input/output error")
+
+
+@pytest.mark.parametrize("error", [FULL, GONE], ids=["full", "gone"])
+@pytest.mark.parametrize("line", ["model export model.npz -o out.glb", "model mesh model.npz -o out.ply",
+                                  "layout transfer layout.json --source template.ply --target model.npz -o out.json"])
+def test_a_disk_that_is_full_or_goes_away_is_told_with_the_file(place, capsys, monkeypatch, line, error):
+    def fail(*args, **kwargs):
+        raise error
+
+    monkeypatch.setattr("pathlib.Path.write_bytes", fail)
+    monkeypatch.setattr("os.write", fail)
+    monkeypatch.setattr("os.replace", fail)
+    before = sorted(place.rglob("*"))
+    assert main(line.split()) == 1
+    told = capsys.readouterr().err.strip().splitlines()[-1]
+    assert f"{line.split()[-1]}: " in told and "Errno" not in told
+    assert ("the disk is full" if error is FULL else "Input/output error") in told
+    assert sorted(place.rglob("*")) == before
+
+
+@pytest.mark.parametrize("name", ["two words", "it's", "-anna", 'quo"te', "$HOME", "\u00e4" * 90])
+def test_a_scan_of_any_name_is_taken(place, capsys, name):
+    (place / "scans" / "scan0.ply").rename(place / "scans" / f"{name}.ply")
+    (place / "scans" / "scan0.landmarks.json").rename(place / "scans" / f"{name}.landmarks.json")
+    assert main(["prep", "clean", f"scans/{name}.ply", "-o", f"{name}.ply"]) == 0
+    assert (place / f"{name}.ply").exists() and name in capsys.readouterr().err
+    assert main(["prep", "clean", "-o", "out.ply", "--", f"{name}.ply"]) == 0
+    assert main(["prep", "clean", f"{name}.ply", "-o", "more.ply"]) == (2 if name[0] == "-" else 0)
+    assert name[0] != "-" or f"write ./{name}.ply" in capsys.readouterr().err

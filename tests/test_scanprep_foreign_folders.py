@@ -273,5 +273,42 @@ def test_what_a_terminal_is_told_does_not_steer_it(capsys):
 
 def test_a_scan_whose_name_is_no_text_is_named(tmp_path):
     (tmp_path / "an\x1bna.ply").write_bytes(b"")
-    with pytest.raises(ValueError, match=r"an\\x1bna\.ply.*rename"):
+    with pytest.raises(ValueError, match=r"an\\x1bna.*rename"):
         find_scans(tmp_path)
+
+
+ALIKE = {"case": ("Anna", "anna"), "accents": ("Ann\u00e9", "Anne\u0301"), "both": ("\u00c4NNE", "a\u0308nne"),
+         "sharp s": ("gro\u00df", "GROSS")}
+
+
+@pytest.mark.parametrize("names", ALIKE.values(), ids=ALIKE)
+def test_names_that_are_one_folder_elsewhere_are_refused_before_the_work(home, tmp_path, names):
+    says = f"'{names[0]}' and '{names[1]}' are one name"
+    for name in names:
+        (home / f"{name}.ply").write_bytes(b"")
+    with pytest.raises(ValueError, match="are one name"):
+        find_scans(home)
+    with workspace(tmp_path / "new") as space, pytest.raises(ValueError, match=says):
+        space.run(Copy(), [Task(name, home / "in.txt", name) for name in names])
+    template = Mesh(np.vstack([np.eye(3), np.zeros(3)]), [[0, 1, 2], [0, 2, 3], [0, 3, 1], [1, 3, 2]])
+    made = RegisteredSet.create(tmp_path / "set", template).add(names[0], template)
+    with pytest.raises(ValueError, match=says):
+        made.add(names[1], template)
+    assert [path.stem for path in (tmp_path / "set" / "meshes").iterdir()] == [names[0]]
+
+
+HARD_NAMES = ("two words", "it's", "-anna", "--help", 'quo"te', "$HOME", "a%2Fb", "\u00e4" * 90,
+              "\u65e5" * 66, "n" * 200)
+
+
+def test_names_of_any_signs_and_length_are_done_and_found_again(home):
+    tasks = [Task(name, home / "in.txt", name) for name in HARD_NAMES]
+    (home / "in.txt").write_text("text")
+    for fresh in (HARD_NAMES, ()):
+        with workspace(home / "all") as space:
+            done = space.run(Copy(), tasks)
+        assert not done.failures and done.fresh == fresh
+        assert {path.name for path in (home / "all").iterdir() if path.name != HOME} == {*HARD_NAMES}
+    for name in ("n" * 201, "\u65e5" * 67):
+        with workspace(home / "all") as space, pytest.raises(ValueError, match=r"at most 200 bytes.*rename"):
+            space.run(Copy(), [Task(name, home / "in.txt", name)])

@@ -168,6 +168,17 @@ def test_a_name_like_a_formula_comes_back_and_no_spreadsheet_runs_it(tmp_path, e
 
 
 @pytest.mark.parametrize("ending", WRITTEN)
+@pytest.mark.parametrize("name", ["bell\x07", "two\nlines", "\x1b[2J", "tab\tin", "\ufffe"])
+def test_a_name_with_control_characters_comes_back_or_is_refused(tmp_path, ending, name):
+    try:
+        write_landmarks(tmp_path / f"a{ending}", {name: np.array([1.0, 2, 3])})
+    except ValueError as error:
+        assert "write JSON" in str(error)
+        return
+    assert [*read_landmarks(tmp_path / f"a{ending}")] == [name]
+
+
+@pytest.mark.parametrize("ending", WRITTEN)
 @pytest.mark.parametrize("data", [b"", bytes(range(256)) * 4, b"\x00\x01\x02"])
 def test_what_cannot_hold_landmarks_is_one_line(tmp_path, ending, data):
     (tmp_path / f"a{ending}").write_bytes(data)

@@ -14,7 +14,7 @@ import pytest
 from click_app import refused_in_one_line, until
 from socket_client import CLOSED, Tab, ask
 
-from scanprep.viewer.gate import one_line
+from scanprep.viewer.gate import file_name, one_line
 from scanprep.viewer.messages import Message
 from scanprep.viewer.served_page import page as html
 from scanprep.viewer.server import Server, Stopped
@@ -200,3 +200,21 @@ def test_a_port_that_is_given_is_taken(app):
         assert server.address.startswith(f"http://127.0.0.1:{port}/?token=")
         with pytest.raises(OSError):
             socket.create_connection(("127.0.0.2", port), timeout=1)
+
+
+def test_the_name_of_a_dropped_file_fits_every_disk():
+    for name in ("\u65e5" * 200 + ".ply", "a" * 500 + ".ply", "\U0001f600" * 100 + ".ply"):
+        short = file_name(name)
+        assert len(short.encode()) <= 120 and short.endswith(".ply")
+
+
+def test_a_disk_that_is_full_is_told_in_a_line(app, monkeypatch):
+    def fail(message, send):
+        raise OSError(28, "No space left on device", "anna.landmarks.json")
+
+    monkeypatch.setattr(app, "handle", fail)
+    told = []
+    with Server(app, say=told.append) as server, Tab(server) as tab:
+        tab.send("click", number=1)
+        assert "anna.landmarks.json: the disk is full" in tab.receive("error").fields["text"]
+    assert not told

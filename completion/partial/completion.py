@@ -72,6 +72,9 @@ MASK = "mask.json"
 # Landmarks off by more than ASTRAY of the body's size, with less than ENOUGH of the scan explained, mean that left and
 # right are exchanged. Either alone also occurs in correct results.
 ASTRAY, ENOUGH = 0.016, 0.9
+# Share of a scan without a body near: a lost limb leaves more; so do long hair, 0.05, and clothes, 0.04 to 0.31.
+UNEXPLAINED = 0.03
+CONTORTED = np.radians(75)           # a joint's way from its nearest known pose; a chair has 58, exchanged sides 133
 
 
 @dataclass(frozen=True, eq=False)
@@ -383,8 +386,7 @@ def find_contortion(fit: ScanFit, x: np.ndarray, seen: float, marked: bool) -> s
     """
     names, away = fit.body.skeleton.names, fit.body.joints_from_known(fit.body.split(x)[0])
     worst = int(away.argmax())
-    # degrees from the nearest known pose of the joint; a chair has 58, exchanged sides 133
-    if away[worst] <= np.radians(75):
+    if away[worst] <= CONTORTED:
         return None
     # name the likely cause; 0.25 of the body with data: shins and feet alone have 0.23, one view 0.26 to 0.46
     cause = (f"a part of a body only, {100 * seen:.0f}% of it has data" if seen < 0.25 else
@@ -422,8 +424,7 @@ def completion_doubts(fit: ScanFit, x: np.ndarray, error: np.ndarray, seen: np.n
 
 def find_unexplained(fit: ScanFit, explained: float) -> list[str]:
     """Return how much of the scan has no body near, if it is as much as a limb; pictures have `find_stray`."""
-    # 0.03: a limb that is lost leaves more; so do long hair, 0.05, and clothes, 0.04 to 0.31
-    if fit.cloud.person is not None or 1 - explained <= 0.03:
+    if fit.cloud.person is not None or 1 - explained <= UNEXPLAINED:
         return []
     cause = "a second person, or clutter?" if explained < CROWDED else \
         "more hair or clothes, or clutter" if fit.cloud.masked is not None else "clutter, or a limb elsewhere"

@@ -29,10 +29,11 @@ from scanprep.registration.ground import soles_row
 
 from .clicked_markers import extra_markers, write_clicked_markers
 from .colors import ColorConfig, blend, carry_colors, views_with_colors
-from .completion import Completion, complete
+from .completion import Completion
 from .masks import read_mask
 from .report import completion_page, completion_panes, picture_completion
 from .settings import CompletionConfig
+from .wrong_landmarks import complete_named
 
 EXPECTED, EXPLAINED = "expected error of the body, mean", "share of the scan that lies on the body"
 MEASURED = "share of the body that was measured"
@@ -107,7 +108,8 @@ def complete_files(work: CompletionTask, inputs: CompletionInputs, context: Task
     # complete, which is kept for a later run, and write everything
     scan = list(files.views) if depth is None else depth
     done = context.step("completion", (work.body, work.marks, work.config, work.unit, inputs),
-                        lambda: complete(work.body, scan, landmarks, work.config, context.report_progress, masked))
+                        lambda: complete_named(work.body, scan, landmarks, work.marks, work.config,
+                                               context.report_progress, masked))
     masked = done.not_skin if masked is None else masked
     return [*write_results(work, inputs, files, done, landmarks, masked, context.folder),
             *write_clicked_markers(context.folder, done, extra_markers(named, work.marks))]

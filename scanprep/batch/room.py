@@ -3,6 +3,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import re
 import shutil
 import warnings
 from collections.abc import Callable, Iterator, Sequence
@@ -13,7 +14,7 @@ from urllib.parse import quote
 
 from ..geometry import storage
 from ..threads import one_thread
-from ..words import OUR_MODULES
+from ..words import OUR_MODULES, explain_os_error
 from .digests import Digests, paths_of
 from .values import load_step_header, load_value, save_value
 
@@ -93,7 +94,14 @@ class TaskContext:
     def _step_file(self, name: str) -> Path:
         """Return the file of a step; its name may hold any character."""
         assert self._steps is not None, "steps are kept"
-        return self._steps / f"{quote(name, safe=' ')}.npz"
+        return self._steps / f"{plain_name(name)}.npz"
+
+
+def plain_name(name: str) -> str:
+    """Return a name as a file name; `unquote` gives it back."""
+    quoted = quote(name, safe=" ")
+    # what is not ASCII is three times as long when quoted: where that is too long for a disk, it stays
+    return quoted if len(quoted) <= 200 else re.sub(r'[%/\\:*?"<>|]', lambda sign: quote(sign[0], safe=""), name)
 
 
 def attempt(work: Any, job: Job, report_progress: Progress | None = None) -> Any:
@@ -104,7 +112,7 @@ def attempt(work: Any, job: Job, report_progress: Progress | None = None) -> Any
         with _notes_of(files), one_thread():              # results are the same to the last digit wherever it runs
             return work(job.given, TaskContext(folder, job.steps, report_progress, job.force))
     except Exception as error:
-        text = " ".join(str(error).split())
+        text = explain_os_error(error, job.name) if isinstance(error, OSError) else " ".join(str(error).split())
         # an unexpected kind of error is named, for whoever reports it
         if not isinstance(error, ValueError | OSError | ModuleNotFoundError):
             text = f"{type(error).__name__}: {text}"

@@ -21,12 +21,14 @@ from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from typing import Any, TypeVar
-from urllib.parse import quote, unquote
+from urllib.parse import unquote
 
 from ..geometry import storage
+from ..words import check_names
 from .digests import Digests
 from .ownership import HOME, ForeignFileError, add_written, digests_in_report, refusal, report_path
 from .pool import Failure, Job, Progress, Workers, run_jobs
+from .room import plain_name
 from .values import load_step_header, load_value, save_value
 
 RECORD = ".record.npz"                    # hidden, as it lies among the files of the result until all are moved
@@ -117,11 +119,12 @@ class Workspace:
         common = self.digests.of(work)
         keys = {task.name: self._key(common, task) for task in tasks}
         assert len(keys) == len(tasks), "names of tasks differ"
+        check_names((task.place or task.name for task in tasks), str(self.folder))
         # look up kept results, find tasks whose place is taken, and make jobs of the rest
         outcomes: dict[str, Any] = {name: self._load_if_valid(name, key) for name, key in keys.items()}
         pending = [task for task in tasks if outcomes[task.name] is NOTHING]
         outcomes |= {task.name: Failure(line) for task in pending if (line := self._why_blocked(task))}
-        jobs = [Job(task.name, task.given, self._making(), task.place, self.home / "steps" / _plain(task.name),
+        jobs = [Job(task.name, task.given, self._making(), task.place, self.home / "steps" / plain_name(task.name),
                     self.force) for task in pending if outcomes[task.name] is NOTHING]
         done = len(tasks) - len(jobs)
         report_progress(done, len(tasks))
@@ -205,7 +208,7 @@ class Workspace:
 
     def list_results(self, start: str) -> list[str]:
         """Return the names of kept results that begin with a text."""
-        return [unquote(path.stem) for path in sorted((self.home / "done").glob(f"{_plain(start)}*.npz"))]
+        return [unquote(path.stem) for path in sorted((self.home / "done").glob(f"{plain_name(start)}*.npz"))]
 
     def drop_others(self, start: str, names: Collection[str] = ()) -> None:
         """Remove the results whose names begin with a text, except the named ones."""
@@ -264,7 +267,7 @@ class Workspace:
 
     def _record(self, name: str) -> Path:
         """Return the file that records a result."""
-        return self.home / "done" / f"{_plain(name)}.npz"
+        return self.home / "done" / f"{plain_name(name)}.npz"
 
     def _publish(self, name: str, staged: Path, key: str, value: Any, work: str = "") -> None:
         """Move a finished result into the output, or raise ForeignFileError if foreign files are in the way.
@@ -281,7 +284,7 @@ class Workspace:
             raise ForeignFileError(refusal(*blocked))
         # one rename makes the result complete; a run killed after it is repaired at the next start
         save_value(staged / RECORD, value, {"digest": key, "work": work, "files": files})
-        ready = self.home / "ready" / _plain(name)
+        ready = self.home / "ready" / plain_name(name)
         ready.parent.mkdir(exist_ok=True)
         os.replace(staged, ready)
         self._settle(ready)
@@ -364,10 +367,6 @@ def _files_of(record: Path, folder: Path) -> dict[str, str]:
     """Return file -> digest of what a result wrote; empty where it has no record."""
     return dict((_read_record(record, folder) or {"files": {}})["files"])
 
-
-def _plain(name: str) -> str:
-    """Return a name as a file name."""
-    return quote(name, safe=" ")
 
 
 @dataclass(frozen=True, eq=False)

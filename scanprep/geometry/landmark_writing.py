@@ -2,12 +2,14 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Callable, Mapping
 from typing import Literal
 from xml.sax.saxutils import escape, quoteattr
 
 import numpy as np
 
+from ..words import printable
 from .format_common import UNITS
 from .tables import csv_text
 
@@ -38,13 +40,17 @@ def encode_landmarks(name: str, points: Points, unit: str | None) -> bytes | Non
     ending = next((ending for ending in _WRITERS if name.lower().endswith(ending)), None)
     if ending is None:
         return None
-    return _WRITERS[ending](points, unit).encode("latin-1" if ending == ".lnd" else "utf-8")
+    try:
+        return _WRITERS[ending](points, unit).encode("latin-1" if ending == ".lnd" else "utf-8")
+    except UnicodeEncodeError as error:
+        raise ValueError(f"landmarks: a name has {error.object[error.start]!a}, which {ending} cannot hold; write JSON"
+                         ) from None
 
 
 def _meshlab(points: Points, unit: str | None) -> str:
     """Encode MeshLab's PickPoints."""
     rows = "".join(f' <point x="{x:.12g}" y="{y:.12g}" z="{z:.12g}" active="1" name={quoteattr(name)}/>\n'
-                   for name, (x, y, z) in _in_unit(points, unit or "m"))
+                   for name, (x, y, z) in _as_xml(points, unit or "m"))
     return f"<!DOCTYPE PickedPoints>\n<PickedPoints>\n{rows}</PickedPoints>\n"
 
 
@@ -77,18 +83,34 @@ def _table(points: Points, unit: str | None) -> str:
 
 def _marker_set(points: Points, unit: str | None) -> str:
     """Encode a marker set of OpenSim 4, all in the frame of the ground."""
-    return marker_set({name: ("/ground", point) for name, point in _in_unit(points, unit or "m")})
+    return marker_set({name: ("/ground", point) for name, point in _as_xml(points, unit or "m")})
 
 
 def marker_set(markers: Mapping[str, tuple[str, np.ndarray]]) -> str:
     """Encode a marker set of OpenSim 4: name -> path of the frame, as `/bodyset/pelvis`, and position (3,), metres."""
     rows = "".join(
-        f"   <Marker name={quoteattr(name)}>\n    <socket_parent_frame>{escape(frame)}</socket_parent_frame>\n"
+        f"   <Marker name={quoteattr(_visible(name))}>\n"
+        f"    <socket_parent_frame>{escape(frame)}</socket_parent_frame>\n"
         f"    <location>{' '.join(map(repr, map(float, place)))}</location>\n    <fixed>false</fixed>\n   </Marker>\n"
         for name, (frame, place) in markers.items())
     return ('<?xml version="1.0" encoding="UTF-8" ?>\n'
             '<OpenSimDocument Version="40000">\n <MarkerSet name="markerset">\n'
             f"  <objects>\n{rows}  </objects>\n  <groups />\n </MarkerSet>\n</OpenSimDocument>\n")
+
+
+_NOT_XML = re.compile("[\x00-\x08\x0b\x0c\x0e-\x1f\ud800-\udfff\ufffe\uffff]")
+
+
+def _as_xml(points: Points, unit: str) -> list[tuple[str, np.ndarray]]:
+    """Return names that XML can hold, and points; ValueError for other names."""
+    if wrong := next((name for name in points if _NOT_XML.search(name)), None):
+        raise ValueError(f"landmarks: {wrong!a} cannot be the name of a landmark in XML; write JSON")
+    return _in_unit(points, unit)
+
+
+def _visible(name: str) -> str:
+    """Write what XML cannot hold as `\\x07`."""
+    return _NOT_XML.sub(lambda sign: printable(sign[0]), name)
 
 
 def _as_text(points: Points, unit: str) -> list[tuple[str, list[str]]]:

@@ -27,6 +27,7 @@ from ..registration.repair import repair_limbs
 from ..registration.schedule import RegistrationConfig
 from ..registration.unit import resolve_unit
 from ..registration.unmarked import doubt_worn, register_by_any
+from ..registration.verdict import explain_by_landmarks
 from ..threads import one_thread
 from .rivals import RIVALS, TWO_BODIES, rival_file, save_figures
 from .scans import ScanTask
@@ -113,14 +114,17 @@ def register_scan(task: ScanTask, template: Mesh, template_landmarks: dict[str, 
                 raise WrongScaleError(f"{task.scan}: {error}") from None
             except ValueError as error:
                 raise ValueError(f"{error} (landmarks beside the scan need no ends of limbs)") from None
-        # refuse a registration that is not on the scan, or has left and right limbs exchanged
-        problem = registration_problem(template, scan, led.fit, landmarks is not None)
+        # refuse a registration that is not on the scan, or has left and right limbs exchanged; landmarks that are wrong
+        # are the cause, which comes first
+        wrong = explain_by_landmarks(template, scan, led.fit, landmarks, template_landmarks, parts,
+                                     settings.registration)
+        problem = registration_problem(template, scan, led.fit, landmarks is not None) or (
+            None if parts is None else find_exchanged_sides(template, parts, led.fit.mesh.vertices))
         if problem:
-            raise ValueError(f"{task.scan}: the template is not on it: {problem}")
-        if parts is not None and (problem := find_exchanged_sides(template, parts, led.fit.mesh.vertices)):
-            raise ValueError(f"{task.scan}: the template is not on it: {problem}")
+            raise ValueError(f"{task.scan}: {f'{wrong}: ' if wrong else ''}the template is not on it: {problem}")
         registered = finish_scan(task.name, template, scan, led, parts, removed, settings.pictures)
-        doubts = registered.figures.doubts if registered.rival is None else (*registered.figures.doubts, TWO_BODIES)
+        doubts = (*([] if wrong is None else [PlausibilityIssue(100.0, wrong)]), *registered.figures.doubts,
+                  *([] if registered.rival is None else [TWO_BODIES]))
     return replace(registered, figures=replace(registered.figures, doubts=doubts, seconds=time.perf_counter() - start))
 
 

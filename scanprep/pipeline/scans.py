@@ -8,7 +8,7 @@ from pathlib import Path
 from ..geometry import storage, tables
 from ..geometry.files import SCAN_ENDINGS, MeshFileError, advice, is_scan, list_files, name_of
 from ..geometry.landmarks import landmarks_beside, names_no_landmark
-from ..words import printable
+from ..words import check_names
 
 TABLE = "scans.csv"               # optional table beside the scans
 ABOUT = {"digest": False}         # fields that only go into tables, so changing them registers nothing again
@@ -45,9 +45,6 @@ def find_scans(folder: str | Path, landmarks: str | Path | None = None, subject:
     paths: dict[str, Path] = {}
     for path in list_files(folder, is_scan):
         name = name_of(path)
-        if printable(name) != name:            # names appear in tables, pages and messages
-            raise ValueError(f"{folder}: expected names without control characters, found {path.name!a}; "
-                             "rename it")
         if name in paths:
             raise ValueError(f"{folder}: expected one file a scan, found {paths[name].name} and {path.name}, both "
                              f"of the name '{name}'; rename one, or merge them where they are views of one scan")
@@ -57,6 +54,7 @@ def find_scans(folder: str | Path, landmarks: str | Path | None = None, subject:
         inner = [place.name for place in sorted(folder.iterdir()) if place.is_dir() and list_files(place, is_scan)]
         hint = f"; there are some in its folders {', '.join(inner[:5])}: name one of them" if inner else ""
         raise MeshFileError(f"{folder}: expected scans ({', '.join(SCAN_ENDINGS)}), found none{hint}")
+    check_names(paths, str(folder))
     about = _read_table(folder / TABLE)
     unknown = sorted(set(about) - set(paths))
     if unknown:

@@ -16,6 +16,7 @@ from ..correspondence.correspondences import read_correspondences, write_corresp
 from ..correspondence.search import CorrelatedConfig
 from ..geometry.files import read_mesh, read_scan, write_mesh
 from ..geometry.landmarks import (
+    find_template_landmarks,
     landmarks_beside,
     match_landmarks,
     read_landmarks,
@@ -34,7 +35,7 @@ from .repair import repair_limbs
 from .schedule import RegistrationConfig
 from .unit import resolve_unit
 from .unmarked import FEW, register_by_any
-from .verdict import judge_registration
+from .verdict import explain_by_landmarks, judge_registration
 
 
 def align(source: MeshArg, target: Annotated[Path, Place("TARGET")], output: Output, landmarks: Path | None = None,
@@ -174,6 +175,8 @@ def register_one(scan: ScanArg, template: Path, output: Output, landmarks: Path 
         led_by.append(Metric("led by", led.way))
     # rest the soles on the floor if the scan ends flat there
     fit = with_soles(body, data, fit, parts)
+    known = find_template_landmarks(template, body, template_landmarks)
+    wrong = explain_by_landmarks(body, data, fit, pairs, known, parts, config)
     write_mesh(output, fit.mesh)
     return Outcome(output, [
         *led_by, Metric("distance to the scan, RMS", MM * fit.rms, "mm"),
@@ -184,4 +187,5 @@ def register_one(scan: ScanArg, template: Path, output: Output, landmarks: Path 
         Metric("inverted triangles", fit.inverted), Metric("limbs rolled otherwise", str(fit.rolled)),
         *soles_row(fit.soles),
         Metric("converged", str(fit.converged))], {"register": config},
-                   judgement=judge_registration(scan.name, body, data, fit, pairs, parts, rival is not None, worn))
+                   judgement=judge_registration(scan.name, body, data, fit, pairs, parts, rival is not None, worn,
+                                                    wrong))

@@ -21,7 +21,7 @@ from ..geometry.mesh import Mesh
 from ..geometry.sides import other_side
 from ..judgement import extent
 from ..pictures.scene import Pane, pack_scene
-from ..words import number_of
+from ..words import explain_os_error, number_of
 from .app import Send
 from .clicked import Clicked, Places, camera_like, camera_of, predict_landmarks
 from .landmark_names import next_name
@@ -384,7 +384,9 @@ class PickApp:
             try:
                 try:
                     note = work(report_progress)
-                except (ValueError, OSError) as error:
+                except OSError as error:
+                    note = f"{failed}: {explain_os_error(error, self.template.path)}"
+                except ValueError as error:
                     note = f"{failed}: {error}"
                 except Exception as error:         # an error in our code: its traceback goes to the terminal
                     note = f"{failed}: unexpected {type(error).__name__}: {error}"

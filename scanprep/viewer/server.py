@@ -23,6 +23,7 @@ from tornado.web import Application
 
 from .. import console
 from ..interrupts import terminate_as_interrupt
+from ..words import explain_os_error
 from . import handlers
 from .app import App, Send
 from .gate import Gate, one_line
@@ -158,8 +159,8 @@ class Server:
 
     def _report_failure(self, problem: BaseException) -> None:
         """Report a failed job to the tabs; an unexpected error also once in the terminal."""
-        text = str(problem)
-        if not isinstance(problem, ValueError):
+        text = explain_os_error(problem, "the file") if isinstance(problem, OSError) else str(problem)
+        if not isinstance(problem, ValueError | OSError):
             text = f"unexpected {type(problem).__name__}: {problem}"
             traceback_text = "\n".join(map(one_line, "".join(traceback.format_exception(problem)).splitlines()))
             if traceback_text not in self._told:

@@ -10,6 +10,7 @@ from typing import Literal, cast, get_args
 from scanprep.arguments import UsageError
 from scanprep.batch.workspace import HOME
 from scanprep.geometry import storage, tables
+from scanprep.words import check_names, fold_name
 
 from ..files.markers import READERS, label_prefixes, marker_subjects
 from ..files.text import MarkerFileError
@@ -169,11 +170,13 @@ def _name_recordings(person: str, files: list[tuple[_File, str | None]]) -> tupl
         return folder_name("_".join((*folders, file.path.name if ending else file.path.stem)))
 
     short = [name(file, False) for file, _ in files]
-    names = [name(file, short.count(s) > 1) for s, (file, _) in zip(short, files, strict=True)]
+    alike = [fold_name(each) for each in short]
+    names = [name(file, alike.count(fold_name(s)) > 1) for s, (file, _) in zip(short, files, strict=True)]
     for one in names:
         if names.count(one) > 1:
             paths = " and ".join(str(f.path) for n, (f, _) in zip(names, files, strict=True) if n == one)
             raise ValueError(f"{paths}: expected files of different names for one person, {person}")
+    check_names(names, person)
     return tuple(Recording(f.path, n, who) for n, (f, who) in zip(names, files, strict=True))
 
 
