@@ -281,6 +281,8 @@ def test_gltf_with_its_numbers_inside_or_beside(tmp_path):
     tree["buffers"][0]["uri"] = "link.bin"
     (tmp_path / "in" / "a.gltf").write_text(json.dumps(tree))
     refused(tmp_path / "in" / "a.gltf", "leads out", "link.bin")
+    (tmp_path / "two parts.bin").unlink()
+    refused(tmp_path / "a.gltf", "a.gltf: its numbers cannot be read", "two parts.bin: no such file")
 
 
 def test_normalised_integers_of_gltf_are_fractions(tmp_path):

@@ -158,6 +158,8 @@ def read_pieces(source: Path, upright: int, metres: float) -> tuple[dict[str, An
         for piece in (piece for _, pieces in shapes for piece in pieces):
             polygons(source, np.full(len(piece.triangles), 3), piece.triangles.ravel(), len(piece.read("POSITION")))
             rewrite(glb.Glb(), tree, binary, piece, np.ones((len(piece.read("POSITION")), 1)))
+        for image in tree.get("images", []):
+            embed_image(glb.Glb(), source, image)
     if not shapes:
         raise MeshFileError(f"{source}: expected triangles for --own-mesh, found none; leave it out")
     return tree, binary, up, shapes

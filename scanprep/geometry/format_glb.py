@@ -93,7 +93,10 @@ def _one_buffer(path: Path, tree: dict[str, Any], binary: bytes) -> bytes:
             except binascii.Error as problem:
                 raise ValueError(f"a buffer inside is damaged ({problem})") from None
         else:
-            data = load_bytes(file_beside(path, uri))
+            try:
+                data = load_bytes(file_beside(path, uri))
+            except MeshFileError as problem:
+                raise MeshFileError(f"{path}: its numbers cannot be read ({problem})") from None
         spend(memory=len(data), visits=1)            # many may be the same file, or the internal one
         buffers.append(data + b"\0" * (-len(data) % 4))
         starts.append(end)
