@@ -34,7 +34,11 @@ ARRAYS = [{**VIEW, "count": 3}, {"componentType": 5121, "type": "VEC4", "count":
     ("properties.ply", lambda: ("ply\nformat ascii 1.0\nelement vertex 1\n" + "property float x\n" * 100_000
                                 + "end_header\n0\n").encode(), "expected 100000 values of element vertex"),
     ("a.ply.gz", lambda: gzip.compress((HEAD.format("binary_little_endian", 3) + FACES.format(3 * 10**6, "uchar"))
-                                       .encode() + CORNERS + (b"\3" + bytes(12)) * (3 * 10**6)), "unpack to more")])
+                                       .encode() + CORNERS + (b"\3" + bytes(12)) * (3 * 10**6)), "unpack to more"),
+    # ten million faces, of one length but the last
+    ("rows.ply.gz", lambda: gzip.compress((HEAD.format("binary_little_endian", 3) + FACES.format(10**7, "uchar"))
+                                          .encode() + CORNERS + bytes(10**7 - 1) + b"\1" + bytes(4)),
+     "show their parts more than")])
 def test_small_files_fail_by_name_within_their_budget(tmp_path, name, content, words):
     (tmp_path / name).write_bytes(content())
     start = time.process_time()

@@ -16,7 +16,7 @@ from pathlib import Path
 # Bytes of arrays for every byte of a file: text makes up to 60, and packed text as many. Our own arrays of zeros pack
 # a thousand times, so the first 128 MB are free.
 FREE, PER_BYTE = 2**27, 100
-# Nodes, instances and primitives: each is at least one byte of a file, but instances may share theirs.
+# Nodes, instances, primitives, and rows that are read one by one: each is a byte or more, but instances share theirs.
 VISITS = 100_000
 # Seconds of the processor, and as many for each MB: a file of small polygons takes 1 s for a MB, on a fast machine.
 SECONDS, PER_MB = 6.0, 4.0

@@ -15,6 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from . import storage
+from .budget import spend
 from .format_common import (
     Contents,
     Lines,
@@ -162,6 +163,8 @@ def _binary_rows(path: Path, data: bytes, element: Element, start: int, order: s
     """Read rows with lists of varying lengths, one by one."""
     sizes, items = [list[int]() for _ in element.properties], [bytearray() for _ in element.properties]
     for row in range(element.count):
+        if row % 1000 == 999:
+            spend(visits=1000)
         for p, size, item in zip(element.properties, sizes, items, strict=True):
             n = 1
             if p.length_kind:
@@ -215,6 +218,8 @@ def _ascii_rows(lines: Lines, element: Element, rows: range) -> dict[str, _Colum
     """Read text rows with lists of varying lengths, one by one."""
     sizes, items = [list[int]() for _ in element.properties], [list[float]() for _ in element.properties]
     for row in rows:
+        if row % 1000 == 999:
+            spend(visits=1000)
         words = iter(lines.text[row].split())
         try:
             for p, size, item in zip(element.properties, sizes, items, strict=True):
