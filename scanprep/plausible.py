@@ -176,12 +176,12 @@ def another_layout(known: int, off: float, name: str, known_by_name: int, off_by
     Examples
     --------
     >>> another_layout(39, 0.031, "cmu41", 41, 0.020, 0.66)
-    'cmu41 explains 41 labels, 20 mm beside its places; this layout only 39, 31 mm beside its own: another layout?'
+    'cmu41 explains 41 labels, 20 mm beside its places; this layout 39, 31 mm beside its own: another layout?'
     """
     # 0.75: sets of the same labels on two people have 0.38 to 0.68, and 0.83 where two sets are nearly the same
     if known_by_name < known or gain > 0.75:
         return None
-    return (f"{name} explains {known_by_name} labels, {1000 * off_by_name:.0f} mm beside its places; this layout only "
+    return (f"{name} explains {known_by_name} labels, {1000 * off_by_name:.0f} mm beside its places; this layout "
             f"{known}, {1000 * off:.0f} mm beside its own: another layout?")
 
 
