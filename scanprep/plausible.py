@@ -4,6 +4,8 @@ Each question returns a judgement or a reason in words, with the likely cause, o
 """
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from .geometry.mesh import Mesh
@@ -93,6 +95,109 @@ def longest_betas(count: int) -> float:
     from scipy.special import gammainccinv
 
     return float(np.sqrt(max(2 * gammainccinv(count / 2, 1 / ONE_OF), USUAL**2 * count)))
+
+
+def too_fast(speed: float, size: float) -> str | None:
+    """Return that markers or joints of a person move too fast, by their median speed, m/s; None if they do not.
+
+    `size` is that of the body: the root of the area of its skin, metres.
+    """
+    # 5 sizes a second, 7 m/s on a man. Walking has 1, running 4; a walk with ten times its rate 12, one with shuffled
+    # frames 15. Noise of a millimetre moves a marker by 0.05 m/s.
+    return f"the markers move at {speed:.0f} m/s: frames in another order, or the wrong rate?" \
+        if speed > 5.0 * size else None
+
+
+def falls_otherwise(falls: Sequence[float]) -> str | None:
+    """Return that a person falls faster or slower than gravity makes it, by accelerations in flights; None if not.
+
+    Examples
+    --------
+    >>> falls_otherwise([0.09, 0.1])
+    'in 2 jumps the body falls with 0.1 m/s², gravity has 9.8: the wrong rate, or the wrong scale?'
+    """
+    # ten jumps of one person and the somersault of another have 9.0 to 9.8 m/s²
+    if not len(falls) or 0.6 <= float(np.median(falls)) / 9.81 <= 1.6:
+        return None
+    jumps = "a jump" if len(falls) == 1 else f"{len(falls)} jumps"
+    return (f"in {jumps} the body falls with {float(np.median(falls)):.2g} m/s², gravity has 9.8: the wrong rate, or "
+            "the wrong scale?")
+
+
+def impossible_walk(stride: float, behind: float) -> str | None:
+    """Return that nobody walks at such a pace, by the seconds of a gait cycle and the balance; None if somebody may.
+
+    `behind` is how far the extrapolated centre of mass is behind the heel of the standing foot, metres, as the other
+    one leaves the floor (Hof et al. 2005). Somebody slow who puts the weight on the foot first, as in tai chi, has less
+    than 0.
+
+    Examples
+    --------
+    >>> impossible_walk(11.0, 0.03)
+    'a walk with a gait cycle of 11 s would fall backwards at every step: the wrong rate?'
+    """
+    # sprinters have 0.4 s; the slowest patients with a walking frame 3 s. The centre of mass of a walk is 0.27 m ahead
+    # of the heel, at half its rate 0.1 m, at a tenth 0.03 m behind
+    if stride < 0.35:
+        return f"a walk with a gait cycle of {stride:.2f} s: the wrong rate?"
+    return f"a walk with a gait cycle of {stride:.0f} s would fall backwards at every step: the wrong rate?" \
+        if stride > 3.0 and behind > 0 else None
+
+
+def upside_down(heights: np.ndarray, axis: str) -> str | None:
+    """Return that a person stands on the head, by heights (T,) of the head above the feet along an axis of the file.
+
+    A handstand is a part of a recording.
+
+    Examples
+    --------
+    >>> upside_down(np.full(9, -1.5), "z")
+    'the head is below the feet along z in all frames: upside down, or an axis with the wrong sign?'
+    """
+    return f"the head is below the feet along {axis} in all frames: upside down, or an axis with the wrong sign?" \
+        if len(heights) and float(np.mean(heights < 0)) > 0.98 else None
+
+
+def another_layout(known: int, off: float, name: str, known_by_name: int, off_by_name: float, gain: float
+                   ) -> str | None:
+    """Return that a named layout explains a recording better than the one that was given; None if it does not.
+
+    Parameters
+    ----------
+    known, known_by_name : int
+        Labels that the given layout and the named one know.
+    off, off_by_name : float, metres
+        How far these markers are beside their places, in the mean.
+    name : str
+        Of the other layout.
+    gain : float
+        Energy of its fit, per marker, as a share of that of the given one.
+
+    Examples
+    --------
+    >>> another_layout(39, 0.031, "cmu41", 41, 0.020, 0.66)
+    'cmu41 explains 41 labels, 20 mm beside its places; this layout 39, 31 mm beside its own: another layout?'
+    """
+    # 0.75: sets of the same labels on two people have 0.38 to 0.68, and 0.83 where two sets are nearly the same
+    if known_by_name < known or gain > 0.75:
+        return None
+    return (f"{name} explains {known_by_name} labels, {1000 * off_by_name:.0f} mm beside its places; this layout "
+            f"{known}, {1000 * off:.0f} mm beside its own: another layout?")
+
+
+def unequal_scale(stretch: float) -> str | None:
+    """Return that a recording is scaled along one axis, by how many times longer it should be there; None if it fits.
+
+    Examples
+    --------
+    >>> unequal_scale(1.18)
+    "the recording is 15% too short along the body, against the other axes: one axis in another scale?"
+    """
+    # 12 people in 20 spans have 0.97 to 1.07, at 0.85 of their height 1.12 to 1.25, at 1.18 of it 0.83 to 0.90
+    if 0.93 <= stretch <= 1.10:
+        return None
+    share = f"{100 * abs(1 / stretch - 1):.0f}% too {'short' if stretch > 1 else 'long'}"
+    return f"the recording is {share} along the body, against the other axes: one axis in another scale?"
 
 
 def check_unit(scan: Mesh | np.ndarray, body: np.ndarray, what: str) -> None:

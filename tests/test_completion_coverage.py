@@ -70,6 +70,20 @@ def test_points_that_plug_in_gait_computed_are_no_markers():
     assert found.metrics()[0].value == "39 of 39" and found.judgement().verdict == "good"
 
 
+def test_markers_that_were_never_seen_leave_parts_to_guess():
+    """A recording names half of its markers and never shows them: the body was 11% too heavy, and good."""
+    hidden = [label for label in LAYOUT.labels if label[-3:] in ("SHO", "UPA", "ASI", "PSI", "THI", "TIB", "CLAV"[-3:],
+                                                                 "T10", "LAV", "TRN")]
+    _, motion = covered(LAYOUT.labels)
+    for count, words in ((2, ""), (len(hidden), "15 of 39 markers were never seen")):
+        unseen = np.isin(LAYOUT.labels, hidden[:count])
+        seen = Motion(motion.poses, motion.trans, None, 50.0, np.where(unseen, np.nan, 0.005) * np.ones((5, 1)),
+                      LAYOUT.labels, trusted=np.tile(~unseen, (5, 1)))
+        recording = MarkerSequence(np.where(unseen[:, None], np.nan, np.zeros((5, 39, 3))), LAYOUT.labels, 50.0)
+        told = find_coverage(subject(), LAYOUT, [seen], [recording]).judgement()
+        assert (words in told.doubts[0] and "thigh_left" in told.why) if words else told.verdict == "good", told
+
+
 def test_markers_on_one_part_alone_tell_of_no_body():
     many = tuple(f"H{i}" for i in range(9))
     head = MarkerLayout(many, np.repeat(LAYOUT.select(["LFHD"]).nearest, 9))

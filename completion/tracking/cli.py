@@ -57,6 +57,7 @@ def track_frames(frames: FramesArg, output: Output, model: ModelOrNone = None, r
         config: Settings.
     """
     from ..mocap.files.motion_files import write_glb, write_motion_folder
+    from ..mocap.movement import pace_doubts
     from .report import track_page
 
     found = FrameFolder(frames, cameras, unit)
@@ -90,7 +91,7 @@ def track_frames(frames: FramesArg, output: Output, model: ModelOrNone = None, r
     metrics += space.step("animation", of_motion, lambda folder: write_glb(folder / "animation.glb", motion, person))
     space.step("motion", (of_motion, metrics, frames.name), write)
     judgement = Judgement.of(wrong_size(found, person) or tracking_problem(motion),
-                             tracking_doubts(motion, loaded.template))
+                             (*tracking_doubts(motion, loaded.template), *pace_doubts(motion, person)))
     if not isinstance(body, Subject):
         judgement = judgement.merge(person_judgement(loaded, motion.betas))
     return Outcome(output, metrics, {"track": config, "rate": rate, "model": name}, found.problems,

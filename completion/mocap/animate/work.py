@@ -38,13 +38,14 @@ from ..joint_angles import Known, angle_doubts
 from ..labelling.labelled_file import label_first, show_labels
 from ..marker_sets.layout import MarkerLayout
 from ..marker_sets.named import choose_layout
+from ..movement import pace_doubts, posture_doubts
 from ..pose.coverage import find_coverage, find_told_parts, untold_spans
 from ..pose.follow import AnimateConfig, animate
 from ..pose.judgement import judge_motions, markers_told, motion_doubts, motion_problem
 from ..pose.pelvis import follow_pelvis
 from ..retargeting.retarget import morph_vertices, retarget
 from ..subject.misplaced_markers import MisplacedMarkers, find_misplaced_markers
-from ..subject.person import PersonConfig, PersonFit, find_person
+from ..subject.person import PersonConfig, PersonFit, doubt_layout, find_person
 from .motions import bring, names_motion
 
 BetasTo = dict[float, np.ndarray] | np.ndarray      # keys over seconds, betas (k,) at the end or (T, k) of every frame
@@ -110,7 +111,9 @@ class AnimateTask:
         if body is None:
             usual = layout
             sequence, fit, misplaced = self._person(sequence, layout, context)
-            placed = fit.judgement(usual)
+            rival = context.step("another layout", (self.model, sequence, usual, fit, self.person),
+                                 lambda: doubt_layout(self.model, [sequence], usual, fit, self.person))
+            placed = Judgement.of(check=filter(None, [rival])).merge(fit.judgement(usual))
             body, layout = self.model.subject(fit.betas), fit.layout
             metrics += [Metric("subject", f"{len(fit.betas)} betas from {len(fit.frames)} frames"),
                         *misplaced.metrics(), *fit.metrics(usual)]
@@ -127,7 +130,8 @@ class AnimateTask:
         covered = find_coverage(body, layout, [motion], [sequence])
         told = find_told_parts(body, layout, motion)
         moving = Judgement.of(motion_problem(motion, body.template, layout, sequence),
-                              motion_doubts([motion], [sequence], body.template) + angle_doubts(motion, body, told))
+                              motion_doubts([motion], [sequence], body.template) + pace_doubts(motion, body, told)
+                              + posture_doubts(motion, body, told) + angle_doubts(motion, body, told))
         judgement = covered.judgement().merge(labelling, moving, misplaced.judgement(sequence.labels), placed)
         if fit is not None:
             judgement = judge_motions(person_judgement(self.model, fit.betas), judgement, [motion], body.template)

@@ -77,7 +77,7 @@ def find_gait_events(motion: Motion, subject: Subject, centres: np.ndarray, angl
     if not {"pelvis_tilt", "ankle_angle_l", "ankle_angle_r"} <= set(angles.names):
         return None
     heels, toes, leg = locate_feet(motion, subject, centres, angles)
-    walk = _keep_walk(detect_events(heels, toes, leg, motion.rate))
+    walk = find_walk(heels, toes, leg, motion.rate)
     cycles = {side: np.array([cycle for cycle in own if _goes_straight(angles, *(motion.rate * cycle))]).reshape(-1, 2)
               for side, own in _find_cycles([(time, side) for time, side, kind in walk if kind == "strike"]).items()}
     return GaitEvents(tuple(walk), cycles, FROM_FEET) if any(map(len, cycles.values())) else None
@@ -165,6 +165,11 @@ def detect_events(heels: np.ndarray, toes: np.ndarray, leg: float, rate: float) 
             at, _ = find_peaks(smooth, prominence=REACH * leg, height=0.0 if kind == "strike" else None)
             out += [(float(t) / rate, side, kind) for t in at]
     return sorted(out)
+
+
+def find_walk(heels: np.ndarray, toes: np.ndarray, leg: float, rate: float) -> list[Event]:
+    """Return the events of heels and toes that follow each other as in a walk; arguments as of `detect_events`."""
+    return _keep_walk(detect_events(heels, toes, leg, rate))
 
 
 def _keep_walk(events: Iterable[Event]) -> list[Event]:

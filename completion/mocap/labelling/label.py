@@ -3,22 +3,26 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from model.body import BodyModel
 from model.linear import Subject
+from model.people import person_judgement
 from scanprep.judgement import Judgement
 from scanprep.threads import one_thread
 
 from ...motion import Motion, Progress
 from ..files.markers import MarkerSequence
 from ..marker_sets.layout import MarkerLayout
+from ..movement import pace_doubts, posture_doubts
 from ..pose.follow import animate
+from ..pose.judgement import motion_doubts, motion_problem
 from ..pose.marked_body import AnimateConfig, MarkedBody
 from ..subject.frame_starts import mean_person
-from ..subject.person import PersonFit, find_person
+from ..subject.misplaced_markers import find_misplaced_markers
+from ..subject.person import PersonConfig, PersonFit, find_person
 from .assignment import assign_by_places, elect, find_displaced, label_of_track, mean_offsets, take_columns
 from .body_search import OTHERS, UPS, BodySearch, Placement
 from .follow_points import KeyFrame, Solutions, count_votes, follow_keys, key_frames, solve_again
@@ -61,6 +65,8 @@ class LabelledMarkers:
         Places of the markers on it.
     person : PersonFit or None
         The fit of the person, where the shape was not known.
+    plausible : Judgement
+        Whether that person can be one, and wears the markers where the layout says.
     """
 
     markers: MarkerSequence
@@ -72,10 +78,11 @@ class LabelledMarkers:
     subject: Subject
     layout: MarkerLayout
     person: PersonFit | None
+    plausible: Judgement = field(default_factory=Judgement)
 
     @property
     def judgement(self) -> Judgement:
-        """Judgement of the labels: share of labelled points, confidence, and fit of the body."""
+        """Judgement of the labels: share of labelled points, confidence, fit of the body, and its movement."""
         there = self.columns >= 0
         doubted = float((self.confidence[there] < SURE).mean()) if there.any() else 1.0
         alone = float(self.unlabelled.sum() / max((self.tracks >= 0).sum(), 1))
@@ -88,7 +95,11 @@ class LabelledMarkers:
             check.append(f"{100 * doubted:.0f}% of the labels are doubtful")
         if alone > 0.1:
             check.append(f"{100 * alone:.0f}% of the points have no label: another person, props, or another layout?")
-        return Judgement.of(bad, check)
+        template = self.subject.template
+        problem = motion_problem(self.motion, template, self.layout, self.markers)
+        check += [*motion_doubts([self.motion], [self.markers], template), *pace_doubts(self.motion, self.subject),
+                  *posture_doubts(self.motion, self.subject)]
+        return self.plausible.merge(Judgement.of(bad or problem, check))
 
 
 def label_markers(model: BodyModel | Subject, points: MarkerSequence, layout: MarkerLayout,
@@ -228,10 +239,23 @@ def label_people(people: Sequence[tuple[BodyModel | Subject, MarkerLayout]], poi
     unlabelled = points.seen.copy()
     frames, rows = np.nonzero(columns >= 0)
     unlabelled[frames, columns[frames, rows]] = False
-    return [LabelledMarkers(_sequence(at, mine, body.layout, rate), mine, certain, unlabelled, tracks, one.motion,
-                            body.subject, body.layout, body.fit)
-            for body, one, mine, certain
-            in zip(bodies, moving, _of_each(bodies, columns), _of_each(bodies, sure), strict=True)]
+    labelled = [_sequence(at, mine, body.layout, rate) for body, mine in zip(bodies, _of_each(bodies, columns),
+                                                                             strict=True)]
+    return [LabelledMarkers(markers, mine, certain, unlabelled, tracks, one.motion, body.subject, body.layout, body.fit,
+                            _judge_person(model, body, markers))
+            for (model, _), body, markers, one, mine, certain
+            in zip(people, bodies, labelled, moving, _of_each(bodies, columns), _of_each(bodies, sure), strict=True)]
+
+
+def _judge_person(model: BodyModel | Subject, person: _Person, markers: MarkerSequence) -> Judgement:
+    """Judge a person that was found from labelled markers; a known one is not in question."""
+    if isinstance(model, Subject) or person.fit is None:
+        return Judgement()
+    misplaced = find_misplaced_markers(model, [markers], person.usual, person.fit, PersonConfig())
+    # a body found under exchanged names is strange, and the names are why
+    if misplaced.changes:
+        return misplaced.judgement(markers.labels)
+    return person.fit.judgement(person.usual).merge(person_judgement(model, person.fit.betas))
 
 
 @dataclass(frozen=True, eq=False)

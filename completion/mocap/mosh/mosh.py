@@ -28,6 +28,7 @@ from ..artefacts.results import ArtefactConfig, MarkerArtefacts
 from ..files.markers import MarkerSequence
 from ..joint_angles import Known, angle_doubts, angle_table
 from ..marker_sets.layout import MarkerLayout
+from ..movement import pace_doubts, posture_doubts
 from ..pose.coverage import Coverage, find_coverage, find_told_parts
 from ..pose.follow import animate
 from ..pose.judgement import judge_motions, motion_doubts, motion_problem
@@ -37,7 +38,7 @@ from ..pose.witnesses import ask_witnesses, witness_doubts
 from ..soft_tissue.follow import SoftTissueConfig, follow_soft_tissue
 from ..soft_tissue.soft_tissue import SoftTissue
 from ..subject.misplaced_markers import MisplacedMarkers, find_misplaced_markers
-from ..subject.person import PersonConfig, PersonFit, find_person
+from ..subject.person import PersonConfig, PersonFit, doubt_layout, find_person
 from .inputs import MarkerSource, load_default_model, read_recordings, recognise_layout
 
 T = TypeVar("T")
@@ -147,6 +148,8 @@ class MoshResult:
         The markers as they were recorded.
     usual : MarkerLayout
         Where such markers usually sit.
+    rival : str or None
+        The doubt that a named layout explains the recordings better.
 
     Examples
     --------
@@ -177,6 +180,7 @@ class MoshResult:
     angles: AngleConfig = field(default_factory=AngleConfig)
     recordings: tuple[MarkerSequence, ...] = ()
     usual: MarkerLayout | None = None
+    rival: str | None = None
     __repr__ = describe_result
 
     @cached_property
@@ -203,10 +207,13 @@ class MoshResult:
             off = ask_witnesses(motion, subject, markers, self.covered.used)
             problem = motion_problem(motion, subject.template, self.layout, markers)
             problems += [whose + problem] if problem else []
-            doubts += [whose + why for why in (*angle_doubts(motion, subject, told), *witness_doubts(off))]
+            doubts += [whose + why for why in (
+                *pace_doubts(motion, subject, told), *posture_doubts(motion, subject, told),
+                *angle_doubts(motion, subject, told), *witness_doubts(off))]
         motions, usual = [self.motions[i] for i in names], self.usual or self.layout
         moving = motion_doubts(motions, [self.recordings[i] for i in names], self.model.template)
-        own = self.covered.judgement().merge(labelling, Judgement.of(problems, (*moving, *doubts)),
+        own = self.covered.judgement().merge(labelling, Judgement.of(problems, (*filter(None, [self.rival]), *moving,
+                                                                                *doubts)),
                                              self.misplaced.judgement(usual.labels), self.person.judgement(usual))
         return judge_motions(person_judgement(self.model, self.betas), own, motions, self.model.template)
 
@@ -285,6 +292,7 @@ def mosh(recordings: MarkerSource | Sequence[MarkerSource], model: BodyModel | N
     for trial in trials:
         stages.relabel(trial)
     person = stages.find_person(trials, layout)                                 # [MoSh] Eq. 23, shape and markers
+    rival = stages.doubt_layout(trials, layout, person)
     misplaced = stages.find_misplaced_markers(trials, layout, person)
     if misplaced.changes:
         for trial in trials:
@@ -313,7 +321,7 @@ def mosh(recordings: MarkerSource | Sequence[MarkerSource], model: BodyModel | N
     every = [trial.result() for trial in trials]
     return MoshResult(model, person.fit.betas, person.fit.layout, person.fit, tuple(motion for motion, _, _ in every),
                       tuple(soft for _, soft, _ in every if soft is not None), tuple(found for *_, found in every),
-                      misplaced, stages.seconds, config.angles, tuple(sequences), layout)
+                      misplaced, stages.seconds, config.angles, tuple(sequences), layout, rival)
 
 
 @dataclass(eq=False)
@@ -401,6 +409,11 @@ class _Stages:
         return _Person(self.model, self.run(
             "person", f"{again} person".strip(), (self.model, used, layout, config),
             lambda report_progress: find_person(self.model, used, layout, config, report_progress, step), not again))
+
+    def doubt_layout(self, trials: Sequence[_Trial], layout: MarkerLayout, person: _Person) -> str | None:
+        """Find the doubt that a named layout explains the recordings better."""
+        inputs = self.model, [trial.markers for trial in trials], layout, person.fit, self.config.person
+        return self.run("person", "another layout", inputs, lambda _: doubt_layout(*inputs))
 
     def find_misplaced_markers(self, trials: Sequence[_Trial], layout: MarkerLayout, person: _Person
                                ) -> MisplacedMarkers:

@@ -40,6 +40,10 @@ class Coverage:
         Names of the parts whose poses are guesses.
     skin : float
         Share of the skin on the unseen parts.
+    never : tuple of str
+        Markers of the layout that the recordings name and never show.
+    hidden : tuple of str
+        Names of the parts that carry as many of these as of the others.
     keypoints : tuple of str
         Labels that tell that the points are joint centres of a video; none where they are markers on skin.
     """
@@ -51,6 +55,8 @@ class Coverage:
     unseen: tuple[str, ...]
     skin: float
     keypoints: tuple[str, ...] = ()
+    never: tuple[str, ...] = ()
+    hidden: tuple[str, ...] = ()
 
     def metrics(self) -> list[Metric]:
         """Return the rows of the table: markers used, and parts without markers."""
@@ -70,6 +76,11 @@ class Coverage:
         # who wears another set beside a whole one has other labels too
         elif len(self.used) < 0.5 * self.count and self.unseen and not self.keypoints:
             check.append(f"{used}: other labels than the marker set's? (scape layout show)")
+        # 0.25 of the markers: one of 42 in a right recording; half of them leave girths to guess, 11% of the volume
+        every = len(self.never) + len(self.used)
+        if len(self.never) > 0.25 * every:
+            check.append(f"{len(self.never)} of {every} markers were never seen: the pose or the girth of "
+                         f"{', '.join(self.hidden)} is a guess")
         # 0.25 of the skin: both hands have 5%, a head 7%, all above the waist 60%
         if self.skin > 0.25:
             check.append(f"no marker saw {', '.join(self.unseen)}: a guess, and their angles are left out")
@@ -105,11 +116,18 @@ def find_coverage(subject: Subject, layout: MarkerLayout, motions: Sequence[Moti
     known = {layout.aliases.get(label, label) for label in used - doubted}
     part_of_marker = skeleton.part_of_vertex(body)[layout.nearest]
     seen = np.unique(part_of_marker[np.isin(layout.labels, sorted(known))])
+    # markers that the recordings name and never show, and the parts with as many of them as of others
+    named = {layout.aliases.get(label, label) for one in markers for label in one.labels}
+    never = np.isin(layout.labels, sorted(named - {layout.aliases.get(label, label) for label in used}))
+    lost, kept = (np.bincount(part_of_marker[some], minlength=len(skeleton.parents)) for some in
+                  (never, np.isin(layout.labels, sorted(known))))
     told = np.any([find_told_parts(subject, layout, motion).any(axis=0) for motion in motions], axis=0)
     area = np.bincount(skeleton.part_of_face, body.face_areas, minlength=len(told))
     names = np.array(skeleton.names)
     return Coverage(tuple(sorted(used)), len(lasting | used), told, tuple(names[seen].tolist()),
-                    tuple(names[~told].tolist()), float(area[~told].sum() / area.sum()), keypoints)
+                    tuple(names[~told].tolist()), float(area[~told].sum() / area.sum()), keypoints,
+                    tuple(np.array(layout.labels)[never].tolist()),
+                    tuple(names[(lost > 0) & (lost >= kept)].tolist()))
 
 
 def marker_labels(labels: Iterable[str]) -> set[str]:

@@ -8,7 +8,7 @@ import numpy as np
 from scanprep.console import Metric
 from scanprep.geometry.mesh import Mesh
 from scanprep.judgement import HAND, Judgement, extent, size
-from scanprep.plausible import unit_problem
+from scanprep.plausible import too_fast, unit_problem
 
 from ...motion import Motion
 from ..files.markers import MarkerSequence
@@ -78,16 +78,7 @@ def motion_doubts(motions: Sequence[Motion], markers: Sequence[MarkerSequence], 
     # 0.018 of the size, 25 mm on a man: good motions are 4 to 25 mm off, shuffled frames 31
     if off > 0.018 * size(body):
         reasons.append(f"the markers are {1000 * off:.0f} mm from where the body has them")
-    return (*filter(None, (haste(one, body) for one in markers)), *reasons)
-
-
-def haste(markers: MarkerSequence, body: Mesh) -> str | None:
-    """Return why the markers of a recording move too fast, with the likely cause, or None."""
-    # 5 sizes a second, 7 m/s on a man, for the median marker. Walking has 1, running 4; a walk with ten times its rate
-    # 12, one with shuffled frames 15. Noise of a millimetre moves a marker by 0.05 m/s.
-    speed = marker_speed(markers)
-    return f"the markers move at {speed:.0f} m/s: frames in another order, or the wrong rate?" \
-        if speed > 5.0 * size(body) else None
+    return (*filter(None, (too_fast(marker_speed(one), size(body)) for one in markers)), *reasons)
 
 
 def marker_speed(markers: MarkerSequence) -> float:
@@ -118,5 +109,5 @@ def motion_problem(motion: Motion, body: Mesh, layout: MarkerLayout, markers: Ma
     believed = 100 * float(motion.trusted[seen].mean())
     return (f"the markers are {1000 * off:.0f} mm from where the body has them, {100 * motion.converged.mean():.0f}% "
             f"of the frames converged and {believed:.0f}% of the markers are believed; "
-            + (wrong or haste(markers, body)
+            + (wrong or too_fast(marker_speed(markers), size(body))
                or "labels mixed up, left and right exchanged, another layout, or another model?"))

@@ -402,6 +402,32 @@ class LatentFit:
             state, self._usual(state.layout), state.z, 1.0)
         return {name: float(np.sum(term.energy)) for name, term in both.items()}
 
+    def measure_stretch(self, state: LatentState) -> float:
+        """Estimate how many times longer the observed markers would be along their longest axis to fit a body best.
+
+        It is the Gauss-Newton step at the minimum for two more unknowns: a factor on all axes, which the prior of size
+        shifts, and one on the longest axis, relative to it.
+        """
+        z, usual = state.z, self._usual(state.layout)
+        spans = np.nanmax(self.targets, axis=1) - np.nanmin(self.targets, axis=1)
+        longest = np.eye(3)[spans.mean(axis=0).argmax()]
+        centred = np.nan_to_num(self.targets - np.nanmean(self.targets, axis=1, keepdims=True))
+        by_scales = -np.stack([centred, centred * longest], axis=-1)
+
+        def widen(term: Residual) -> Residual:
+            return Residual(term.values, np.concatenate(
+                [term.jacobian, np.zeros((*term.jacobian.shape[:-1], 2))], axis=-1))
+
+        found, weights = self.simulate(state, state.x, z), self.weights(state)
+        data = marker_term(MovingPoints(found.positions, np.concatenate([found.jacobian, by_scales], axis=-1)),
+                           self.targets, weights)
+        pose = widen(self.of_frames(state, state.x, z, weights, 1.0)["pose"])
+        shared = [widen(Residual(r.values[None], r.jacobian[None])) for r in
+                  self.shared_terms(state, usual, z, 1.0).values()]
+        equations = Arrow(normal_equations([data, pose]), len(z) + 2, normal_equations(shared))
+        size, stretch = equations.step(np.zeros(1))[0][0, -2:]
+        return float(1 + stretch / (1 + size))
+
     def export_layout(self, state: LatentState) -> MarkerLayout:
         """Return the layout with each marker on its triangle, at its own distance, exact in the latent pose."""
         vertices, points, attached = self.latent.at(state.betas), state.places, state.markers

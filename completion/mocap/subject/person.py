@@ -13,12 +13,14 @@ from scanprep.console import Metric
 from scanprep.geometry import rotations
 from scanprep.geometry.farthest_points import farthest_points, spread_indices
 from scanprep.judgement import Judgement
+from scanprep.plausible import another_layout, unequal_scale
 from scanprep.threads import one_thread
 from scanprep.words import describe_result
 
 from ...motion import Progress
 from ..files.markers import MarkerSequence
 from ..marker_sets.layout import MarkerLayout
+from ..marker_sets.named import fitting_layout
 from .frame_starts import mean_person, start_frames
 from .latent_fit import ON_SKIN, LatentFit, PersonConfig
 
@@ -46,6 +48,8 @@ class PersonFit:
         Each term of the energy at the end.
     converged : bool
     iterations : int
+    stretch : float
+        How many times longer the markers would have to be along their longest axis, as `unequal_scale` asks.
     """
 
     betas: np.ndarray
@@ -58,6 +62,7 @@ class PersonFit:
     energies: dict[str, float]
     converged: bool
     iterations: int
+    stretch: float = 1.0
     __repr__ = describe_result
 
     @property
@@ -79,9 +84,10 @@ class PersonFit:
                        1000 * float(np.mean(list(off.values()))), "mm")] if off else []
 
     def judgement(self, usual: MarkerLayout) -> Judgement:
-        """Judge the fit by how far markers were moved along the body; loose ones may be anywhere."""
-        return judge_moves({label: moved for label, moved in zip(self.layout.labels, self.moved, strict=True)
-                            if label not in usual.loose}, len(self.moved))
+        """Judge the fit by its proportions, and by how far markers were moved; loose ones may be anywhere."""
+        moves = judge_moves({label: moved for label, moved in zip(self.layout.labels, self.moved, strict=True)
+                             if label not in usual.loose}, len(self.moved))
+        return Judgement.of(check=filter(None, [unequal_scale(self.stretch)])).merge(moves)
 
 
 def judge_moves(moves: Mapping[str, float], count: int) -> Judgement:
@@ -182,7 +188,27 @@ def find_person(model: BodyModel, sequences: MarkerSequence | Sequence[MarkerSeq
     moved = np.linalg.norm(state.places - fit.usual_places(fit.layout, state.betas), axis=1)
     return PersonFit(state.betas.copy(), fit.export_layout(state),
                      np.stack([which, chosen - np.r_[0, ends][which]], axis=1), rotations.log(rotations.exp(pose)),
-                     trans.copy(), fit.residuals(state), moved, fit.energies(state), converged, steps)
+                     trans.copy(), fit.residuals(state), moved, fit.energies(state), converged, steps,
+                     fit.measure_stretch(state))
+
+
+def doubt_layout(model: BodyModel, sequences: Sequence[MarkerSequence], layout: MarkerLayout, fit: PersonFit,
+                 config: PersonConfig | None = None) -> str | None:
+    """Return the doubt of a layout, with which a person was found, that a named one fits better; None without one."""
+    labels = tuple(dict.fromkeys(label for each in sequences for label in each.labels))
+    try:
+        named, name = fitting_layout(labels, model)
+    except ValueError:                                   # no named set has these labels, or is known on this body
+        return None
+    both = [label for label in fit.layout.labels if label in named.labels and label in layout.labels]
+    apart = np.linalg.norm(layout.select(both).place(model.template) - named.select(both).place(model.template), axis=1)
+    # 5 mm: the same places; and a layout that knows more labels is not asked
+    if len(named.match_labels(labels, 0)) < len(fit.moved) or (len(both) and float(apart.mean()) < 0.005):
+        return None
+    other = find_person(model, sequences, named, config)
+    gain = sum(other.energies.values()) / len(other.moved) / (sum(fit.energies.values()) / len(fit.moved))
+    return another_layout(len(fit.moved), float(fit.moved.mean()), name, len(other.moved), float(other.moved.mean()),
+                          gain)
 
 
 def one_or_more(sequences: MarkerSequence | Sequence[MarkerSequence]) -> list[MarkerSequence]:
