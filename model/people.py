@@ -19,7 +19,7 @@ def person_judgement(model: BodyModel, betas: np.ndarray | None, cause: str = ""
 
     Without betas it is the template's own body. `cause` is the likely reason that the message names.
     """
-    human = {"skullbase", "l_hip", "r_hip", "l_knee", "r_knee"}  # roles that only people's skeletons have
+    human = {"skullbase", "l_knee", "r_knee"}              # roles that only people's skeletons have
     if not find_roles(model.skeleton.names).keys() >= human:
         return Judgement()
     body = model.subject(betas).vertices(np.zeros((len(model.skeleton.parents), 3)))

@@ -7,7 +7,7 @@ from animal_bodies import Animal, random_pose
 from model_bodies import random_poses, worm_model
 
 from completion.__main__ import main
-from model import LearnConfig, choose_skeleton, learn_body
+from model import LearnConfig, choose_skeleton, learn_body, load_built_in_model
 from model.human_poses import is_person
 from model.learning import parts
 from model.learning.parts import ChosenSkeleton, PartsSearch
@@ -82,3 +82,20 @@ def test_a_joint_that_holds_nothing_together_is_named():
                      true.joints[order], tuple(true.names[part] for part in order))
     doubt, = joint_doubts(wrong, joint_gaps(animal.mesh, poses, wrong))
     assert "head to fore left cannon" in doubt and "edit-skeleton" in doubt
+
+
+@pytest.mark.parametrize("prior", ["auto", "none"])
+def test_people_of_half_a_size_are_refused_with_a_prior_and_doubted_without(prior):
+    people = load_built_in_model()
+    poses = people.subject(None).vertices(people.pose_examples[:4])
+    quick = LearnConfig(refinements=0, prunings=(0.01,), ridges=(0.01,))
+
+    def learn(scale):
+        return learn_body(people.template, scale * poses, None, people.skeleton, "scape", quick, prior).judgement
+
+    if prior == "none":
+        assert learn(0.5).reasons[0].startswith("the person is 0.8")
+        assert not any("tall" in why for why in learn(1).reasons)
+    else:
+        with pytest.raises(ValueError, match=r"poses: the bodies are 0\.5 times as large as the template"):
+            learn(0.5)

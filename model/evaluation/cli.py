@@ -12,6 +12,7 @@ from scanprep.cli import Output, Unit
 from scanprep.console import Metric, Outcome, bar
 from scanprep.geometry import storage
 from scanprep.geometry.files import write_mesh
+from scanprep.geometry.members import ONE_BODY, find_doubtful_members
 from scanprep.geometry.tables import write_table
 from scanprep.judgement import Judgement
 from scanprep.ranges import Count, Seed
@@ -78,9 +79,12 @@ def evaluate(model: ModelArg, output: Output, poses: Path | None = None, shapes:
     measured = [(poses_found.errors, posed)] if poses_found is not None else []
     measured += [(shapes_found.errors[-1], people)] if shapes_found is not None else []
     problems = [errors_problem(errors, bodies, loaded) for errors, bodies in measured if bodies is not None]
+    doubts = [] if posed is None else find_doubtful_members(
+        loaded.template, posed, str(poses), pose_names, ONE_BODY if subject is None else np.inf)
+    doubts += [] if people is None else find_doubtful_members(loaded.template, people, str(shapes), people_names)
     return Outcome(output, metrics, {"model": model, "poses": poses, "shapes": shapes, "counts": counts,
                                      "train_shapes": train_shapes, "subject": subject},
-                   judgement=Judgement.of(filter(None, problems)))
+                   judgement=Judgement.of(filter(None, problems), doubts))
 
 
 def sample(model: ModelArg, output: Output, count: Annotated[Count, Alias("-n")] = 9, seed: Seed = 0,

@@ -10,6 +10,7 @@ from typing import Any, Literal
 import numpy as np
 
 from scanprep.batch.room import Step, run_uncached, substeps
+from scanprep.geometry.members import ONE_BODY, measure_scales
 from scanprep.geometry.mesh import Mesh, take_any_mesh
 from scanprep.geometry.upright import find_up
 from scanprep.judgement import Judgement
@@ -169,6 +170,10 @@ def learn_body(template: Mesh, poses: np.ndarray, shapes: np.ndarray | None = No
     known = _bring_prior(body, prior, stage, step)
     # the skeleton where none is given; the poses of a prior show joints that few scans do not bend
     shown = None if known is None or many else known.poses[1:]
+    scale = float(np.median(measure_scales(body, poses)))
+    if shown is not None and not 1 / ONE_BODY < scale < ONE_BODY:
+        raise ValueError(f"poses: the bodies are {scale:.3g} times as large as the template, to which a prior adds its "
+                         "own poses; expected the template's person: the wrong unit, or a template of somebody else?")
     tree, choice = skeleton or (own_skeleton if shown is None else None), None
     if tree is not None:
         tree = sizes.reduce_skeleton(tree)

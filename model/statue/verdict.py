@@ -58,8 +58,8 @@ def judge_statue(statue: FittedStatue, scan: Mesh, finest: Level, left_out: Sequ
     # right ones have up to 0.012, coats 0.025; clicks with left and right exchanged 0.036. Nobody exchanges those that
     # are found; toons have up to 0.044, as their limbs are not alike.
     if misfit > (0.05 if posed.searched else 0.03):
-        check.append(f"features lie {100 * misfit:.1f}% of the height from those of the posed control model: left and "
-                     "right exchanged, one in a wrong place, or clothes?")
+        check.insert(0, f"features lie {100 * misfit:.1f}% of the height from those of the posed control model, "
+                        f"{posed.features.worst}: left and right exchanged, one in a wrong place, or clothes?")
     # a joint that was not found at first is no doubt where the finished surface has data around it
     empty, measured = parts_without_data(statue), part_shares(statue)[MEASURED]
     lacking = [in_words(name) for name, share in zip(control.skeleton.names, measured, strict=True)

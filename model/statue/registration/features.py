@@ -25,6 +25,7 @@ class FeatureFit:
     joint_rms: float      # metres, misfit of the joints; NaN without any
     point_rms: float      # metres, misfit of the points of the surface; NaN without any
     converged: bool
+    worst: str = ""       # the feature that is farthest from its place, and how far
 
 
 def fit_features(control: ControlModel, joints: Mapping[str, np.ndarray],
@@ -69,8 +70,9 @@ def fit_features(control: ControlModel, joints: Mapping[str, np.ndarray],
     centres = scale * frames.joints @ R.T + T[:3, 3]
     apart = scale * np.linalg.norm(model.positions(frames, features) - goal, axis=1)
     vertices = scale * model.positions(frames, model.vertices) @ R.T + T[:3, 3]
+    farthest = f"'{[*joints, *(points or {})][apart.argmax()]}' most, {100 * apart.max():.0f} cm"
     return FeatureFit(pose, scale * model.split(x)[1] * model.lengths, vertices, centres, _rms(apart[:len(joints)]),
-                      _rms(apart[len(joints):]), bool(result.success))
+                      _rms(apart[len(joints):]), bool(result.success), farthest)
 
 
 def feature_misfit(model: Articulated, x: np.ndarray, features: BoundPoints, goal: np.ndarray) -> tuple[float,
