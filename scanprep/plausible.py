@@ -152,9 +152,9 @@ def upside_down(heights: np.ndarray, axis: str) -> str | None:
     Examples
     --------
     >>> upside_down(np.full(9, -1.5), "z")
-    'the head is below the feet along z in all frames: upside down, or an axis with the wrong sign?'
+    'the head is below the feet along z in all frames: upside down, lying, or an axis of the wrong sign?'
     """
-    return f"the head is below the feet along {axis} in all frames: upside down, or an axis with the wrong sign?" \
+    return f"the head is below the feet along {axis} in all frames: upside down, lying, or an axis of the wrong sign?" \
         if len(heights) and float(np.mean(heights < 0)) > 0.98 else None
 
 

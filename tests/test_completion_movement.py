@@ -95,13 +95,13 @@ def test_a_handstand_and_somebody_who_lies_are_not_upside_down():
 
 
 @cache
-def recorded(layout="cmu41"):
+def recorded(step=4):
     """Markers of a set on the walk of a person of the built-in model."""
     model = load_built_in_model()
-    person, places = model.subject(np.random.default_rng(3).normal(size=8)), load_layout(layout, model)
+    person, places = model.subject(np.random.default_rng(3).normal(size=8)), load_layout("cmu41", model)
     ids, weights = supports(model.template, places)
-    points = person.points(ids, weights).evaluate(POSES[:60:4], TRANS[:60:4])
-    return MarkerSequence(rise_above_skin(points, np.asarray(places.distances)), places.labels, 15.0)
+    points = person.points(ids, weights).evaluate(POSES[:60:step], TRANS[:60:step])
+    return MarkerSequence(rise_above_skin(points, np.asarray(places.distances)), places.labels, RATE / step)
 
 
 @pytest.mark.parametrize(("height", "words"), [(1.0, ""), (0.85, "too short along the body"), (1.2, "too long along")])
@@ -127,8 +127,8 @@ def test_a_layout_that_a_named_one_fits_better_is_told():
 @pytest.mark.slow
 def test_labels_of_a_mirrored_recording_are_told():
     model = load_built_in_model()
-    markers, layout = recorded(), load_layout("cmu41", model)
+    markers, layout = recorded(1), load_layout("cmu41", model)
     for side, words in ((1, ""), (-1, "mirrored recording")):
-        points = MarkerSequence(markers.positions[:8] * [side, 1, 1], markers.labels, 15.0)
+        points = MarkerSequence(markers.positions[:30] * [side, 1, 1], markers.labels, RATE)
         told = label_markers(model, points, layout, columns_of_labels(points, layout)).judgement
         assert words in told.why if words else told.verdict == "good", told
