@@ -33,7 +33,7 @@ class ExclusiveWrites:
         if flags & os.O_EXCL:
             self.made.add(path)
         elif path not in self.made and not self._in_new_folder(path) and (frame := _our_frame()) is not None \
-                and not (os.path.basename(path) == "lock" and flags & os.O_NOFOLLOW):
+                and not ("batch/opening.py" in frame and flags & os.O_NOFOLLOW):           # a lock is there for others
             self.wrong.append(f"{path}, opened for writing by {frame}")
 
     def _in_new_folder(self, path):
