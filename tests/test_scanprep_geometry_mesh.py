@@ -205,3 +205,8 @@ def test_what_is_no_template_and_why(mesh, says):
 @every
 def test_manifold_pieces_are_templates(mesh):
     assert template_problem(mesh) is None or not mesh.is_vertex_manifold
+
+
+def test_vertices_without_triangles_have_no_normal():
+    """Where a file holds points alone; sums over no triangle are whole numbers."""
+    assert not Mesh(np.eye(3), np.zeros((0, 3), dtype=np.int64)).vertex_normals.any()

@@ -194,7 +194,7 @@ class Lines:
         """Read numbers (rows, at least `columns`) of equally long rows; else raise the error of the first bad row."""
         if not rows:
             return np.zeros((0, columns), dtype=dtype)
-        if rows.stop <= len(self.text):
+        if rows.stop <= len(self.text) and any(map(bytes.strip, self.text[rows.start:rows.stop])):
             with contextlib.suppress(ValueError):
                 values: np.ndarray = np.loadtxt(self.text[rows.start:rows.stop], dtype=dtype, ndmin=2, comments=None)
                 if values.shape[1] >= columns:

@@ -69,8 +69,8 @@ def _ascii(path: Path, data: bytes) -> np.ndarray:
         raise MeshFileError(f"{path}: expected 3 vertex lines for each of {facets} facets, found {len(rows)}")
     text = [lines.text[row].lstrip()[len("vertex"):] for row in rows]
     with contextlib.suppress(ValueError):
-        table = np.loadtxt(text, ndmin=2, comments=None) if text else np.zeros((0, 3))
-        if table.shape[1] == 3:
+        table = np.loadtxt(text, ndmin=2, comments=None) if any(map(bytes.strip, text)) else np.zeros((0, 3))
+        if table.shape[1] == 3 and len(table) == len(rows):
             return table.reshape(-1, 3, 3)
     bad = next((row for row, line in zip(rows, text, strict=True) if not _is_vertex(line)), rows[0])
     raise lines.fail(bad, "'vertex x y z'")

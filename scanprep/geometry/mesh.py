@@ -388,7 +388,7 @@ def _place(point: np.ndarray) -> str:
 def _unit(v: np.ndarray) -> np.ndarray:
     """Normalise vectors (..., 3); zero stays zero."""
     length = np.linalg.norm(v, axis=-1, keepdims=True)
-    return np.divide(v, length, out=np.zeros_like(v), where=length > 0)
+    return np.divide(v, length, out=np.zeros(v.shape), where=length > 0)
 
 
 def _loops(border: np.ndarray) -> list[np.ndarray]:
