@@ -33,6 +33,15 @@ from scanprep.skeleton.tree import Skeleton
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("seed", [31000304, 31005250, 41007051])
+def test_damage_that_was_once_read_or_refused_wrongly(seed):
+    """Views without triangles, a table of empty cells, and whole numbers that cannot become floating-point ones."""
+    ran = subprocess.run([sys.executable, Path(__file__).with_name("fuzz.py"), "--count", "1", "--seed", str(seed)],
+                         capture_output=True, text=True, check=False)
+    assert ran.returncode == 0, ran.stdout[-5000:]
+
+
+@pytest.mark.slow
 def test_damaged_files_of_every_kind():
     count = os.environ.get("SCAPEKIT_FUZZ", "1500")
     ran = subprocess.run([sys.executable, Path(__file__).with_name("fuzz.py"), "--count", count], capture_output=True,

@@ -393,7 +393,11 @@ def as_floats(path: Path, data: bytes) -> bytes:
             value = link + 4 + data[link + 3]                          # behind type and dimensions
             head[value:value + 4] = minus
     body = numbers.encode(values, "f4")
-    return bytes(head) + body + bytes(-len(body) % BLOCK)
+    made = bytes(head) + body + bytes(-len(body) % BLOCK)
+    if point_table(path, made).kind != "f4":
+        raise MarkerFileError(f"{path}: expected a scale (POINT:SCALE) that can be changed, as its whole numbers do not "
+                              "reach these positions; write .trc or .csv")
+    return made
 
 
 def write_c3d(path: Path, positions: np.ndarray, labels: tuple[str, ...], rate: float,
