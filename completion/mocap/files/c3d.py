@@ -395,8 +395,8 @@ def as_floats(path: Path, data: bytes) -> bytes:
     body = numbers.encode(values, "f4")
     made = bytes(head) + body + bytes(-len(body) % BLOCK)
     if point_table(path, made).kind != "f4":
-        raise MarkerFileError(f"{path}: expected a scale (POINT:SCALE) that can be changed, as its whole numbers do not "
-                              "reach these positions; write .trc or .csv")
+        raise MarkerFileError(f"{path}: expected a scale (POINT:SCALE) that can be changed, as its whole numbers do "
+                              "not reach these positions; write .trc or .csv")
     return made
 
 
