@@ -5,6 +5,7 @@ import pytest
 from model_bodies import worm
 from motion_files import FRAMES, apart, degrees, of_amass, random_poses
 from people_bodies import small_people
+from scipy.sparse import csr_array
 
 from model.export.cli import export
 from model.features import linear_features
@@ -57,11 +58,13 @@ def family_model(tmp_path, kind="smplh"):
     names = (*amass.NAMES, "left_hand", "right_hand")
     skeleton = Skeleton(part, parents, np.stack([mesh.corners.mean(axis=1)[part == j].mean(axis=0) for j in range(24)]),
                         names).with_root_centred(mesh)
-    N = len(mesh.vertices)
-    model = SkinningModel(mesh, skeleton, mesh.vertices, np.eye(24)[skeleton.part_of_vertex(mesh)],
+    # not all of these parts meet, so joints are the means of their vertices
+    N, of_vertex = len(mesh.vertices), skeleton.part_of_vertex(mesh)
+    centres = csr_array(np.stack([(of_vertex == j) / max((of_vertex == j).sum(), 1) for j in range(24)]))
+    model = SkinningModel(mesh, skeleton, mesh.vertices, np.eye(24)[of_vertex],
                           linear_features(skeleton, (np.zeros((3, 0)),) * 24), np.zeros((0, N, 3)), mesh.vertices,
                           np.random.default_rng(0).normal(0, 0.01, (3, N, 3)), np.ones(3) / 3, 1.0, np.zeros((24, 3)),
-                          np.eye(72), {"family": kind})
+                          np.eye(72), {"family": kind}, regressor=centres)
     model.save(tmp_path / "imported.npz")
     return load_model(tmp_path / "imported.npz")
 

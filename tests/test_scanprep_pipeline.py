@@ -81,6 +81,7 @@ def test_limbs_are_rolled_otherwise_where_the_template_is_a_person(scans, templa
     monkeypatch.setattr(one_scan, "find_exchanged_sides", lambda body, parts, vertices: None)
     hidden = PlausibilityIssue(1.0, "hardly anything of the left hand was seen: its place is a guess")
     monkeypatch.setattr(one_scan, "hidden_doubts", lambda parts, mesh, seen: (hidden,))
+    monkeypatch.setattr(one_scan, "explain_by_landmarks", lambda *_: None)
     monkeypatch.setattr(one_scan, "size_doubts", lambda body, parts, vertices: (small,))
     monkeypatch.setattr(one_scan, "with_soles", lambda body, scan, fit, parts: stood.append((fit.rolled, parts)) or fit)
     task = find_scans(scans)[0]

@@ -15,7 +15,6 @@ from scanprep.threads import one_thread
 
 from ..blending import BlendedTemplate, rigid_weights
 from ..body import BodyModel
-from ..digests import body_digests, digest
 from ..scape import ScapeModel
 from ..shape_space import ShapeSpace, body_volumes, learn_shape_space
 from ..shape_statistics import PLANE, SEXES
@@ -26,6 +25,7 @@ from .scape import (
     Progress,
     ProgressShares,
     check_training,
+    describe_bodies,
     learn_pose_with,
     shape_deformations,
     training_metadata,
@@ -87,8 +87,7 @@ def learn_by_sex(template: Mesh, poses: np.ndarray, shapes: np.ndarray, sexes: S
         common["info"]["prior_people"] = 0.0                 # shapes are those of the people alone
     models = {}
     for name, chosen in groups.items():
-        info = {**common["info"], "sex": name, "shapes": len(chosen), "digest": digest(template, poses, people[chosen]),
-                "digests": body_digests(poses, people[chosen])}
+        info = {**common["info"], **describe_bodies(template, poses, people[chosen]), "sex": name}
         if name == "neutral" and plane is not None:
             info[PLANE] = plane
         models[name] = ScapeModel(template, skeleton, learned.space, spaces[name], **{**common, "info": info})

@@ -72,7 +72,7 @@ def read_edited(path: str | Path, size: tuple[int, ...]) -> np.ndarray:
     """Read grey values (H, W) uint16 of an image that an editor saved: 16 bits of grey, or three equal channels."""
     expected = f"an image of {size[1]} x {size[0]} pixels with 16 bits of grey"
     with taking_apart(path, expected):
-        image, depth = _decode_image(Path(path))
+        image, depth = _decode_image(Path(path), expected)
     if image.ndim == 3:
         image = image[..., :3] if image.shape[2] > 2 else image[..., :1]        # without opacity
         if (image != image[..., :1]).any():
@@ -110,19 +110,19 @@ def _read(path: Path, size: tuple[int, ...], kind: Any) -> np.ndarray:
             image = np.asarray(file.pages[0].asarray())
     else:
         with taking_apart(path, "a PNG image"):
-            image = _decode_image(path)[0]
+            image = _decode_image(path, "a PNG image")[0]
     if image.shape != tuple(size) or image.dtype != kind or not np.isfinite(image).all():
         raise StorageError(f"{path}: expected {np.dtype(kind).name} numbers of shape {tuple(size)}, all finite, "
                            f"got {image.dtype} of shape {image.shape}")
     return image
 
 
-def _decode_image(path: Path) -> tuple[np.ndarray, int]:
+def _decode_image(path: Path, what: str) -> tuple[np.ndarray, int]:
     """Decode an image file; return the pixels and the bits per channel."""
-    data = read_bytes(path, "an image")
+    data = read_bytes(path, what)
     if data[:8] == png16.SIGNATURE and png16.depth(data) in ((16, 2), (16, 3), (16, 4)):
         return png16.decode_png16(data), 16
-    with open_image(path, "an image", data) as image:
+    with open_image(path, what, data) as image:
         if image.mode.startswith("I;16") or (image.mode == "I" and image.format == "PNG"):
             return np.asarray(image).astype(np.uint16), 16
         return np.asarray(image), 32 if image.mode in ("I", "F") else 8
