@@ -3,6 +3,7 @@
 That no file is opened for writing which scapekit has not made itself, every test checks (`exclusive_writes`).
 """
 import os
+import resource
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -147,3 +148,18 @@ def test_what_lies_inside_is_not_asked_for(mended):  # noqa: F811
     call = Call.read(mended / "set")
     inside = replace(call, scans=mended / "set" / "scans", template=mended / "set" / "template.ply")
     assert call.ask_outside(mended / "set") and not inside.ask_outside(mended / "set")
+
+
+def test_half_a_copy_is_none(tmp_path):
+    """The disk is full: the landmarks stay as they are, and later there is a whole copy."""
+    (tmp_path / "a.txt").write_text("0 0 0 head\n")
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (4, limits[1]))
+    try:
+        with pytest.raises(OSError, match="too large"):
+            storage.keep_former(tmp_path / "a.txt")
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert [path.name for path in tmp_path.iterdir()] == ["a.txt"]
+    storage.keep_former(tmp_path / "a.txt")
+    assert (tmp_path / "a.txt.before").read_text() == "0 0 0 head\n"

@@ -170,8 +170,13 @@ def writing(path: str | Path) -> Iterator[Path]:
 def create_file(path: str | Path, data: bytes = b"") -> None:
     """Write a new file; FileExistsError where there is anything of that name, also a link that leads nowhere."""
     flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_BINARY", 0)
-    with open(os.open(path, flags, 0o666), "wb") as file:
-        file.write(data)
+    file = open(os.open(path, flags, 0o666), "wb")
+    try:
+        with file:
+            file.write(data)
+    except OSError:                      # a full disk: half a copy would count as one
+        os.unlink(path)
+        raise
 
 
 def keep_former(path: Path, ending: str = ".before") -> None:
