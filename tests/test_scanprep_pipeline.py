@@ -12,7 +12,7 @@ from scan_folders import MARKS, QUICK, ball, contents, write_scans
 from scipy.spatial.transform import Rotation
 
 from model.coregistration.lead import ModelLead
-from scanprep import Mesh, RegisteredSet, read_mesh, write_mesh
+from scanprep import Mesh, RegisteredSet, read_mesh, write_landmarks, write_mesh
 from scanprep.batch.ownership import HOME, ForeignFileError
 from scanprep.batch.pool import Workers
 from scanprep.cleaning.clean_scan import CleanScanConfig
@@ -64,6 +64,18 @@ def test_dots_belong_to_the_names_of_scans(scans, tmp_path):
     tasks = find_scans(tmp_path)
     assert [t.name for t in tasks] == [t.subject for t in tasks] == ["2024.05.01 anna", "2024.05.02 anna"]
     assert [t.landmarks.name for t in tasks] == [f"{t.name}.landmarks.json" for t in tasks]
+
+
+def test_a_scan_of_another_body_is_named(scans, template, tmp_path):
+    """Before the skeleton is sought: three registered people were called one."""
+    larger = read_mesh(scans / "body1.ply")
+    write_mesh(scans / "body1.ply", larger.with_vertices(1.5 * larger.vertices))
+    write_landmarks(next(scans.rglob("body1.landmarks.json")), {n: 1.5 * larger.vertices[v] for n, v in MARKS.items()})
+    tasks = [dataclasses.replace(task, subject="anna") for task in find_scans(scans)]
+    posed = dataclasses.replace(QUICK, min_poses=3)
+    with pytest.raises(ValueError, match=r"scans of anna: body1: it is 1\.\d+ times as large as the other bodies"):
+        prepare(tasks, template, MARKS, tmp_path / "set", posed)
+    assert RegisteredSet.load(tmp_path / "set").names == ("body0", "body1", "body2")
 
 
 def test_limbs_are_rolled_otherwise_where_the_template_is_a_person(scans, template, monkeypatch):
@@ -211,7 +223,7 @@ def test_what_leads_the_template(scans, template, tmp_path):
     best = prepare(tasks, template, MARKS, tmp_path / "best", QUICK)
     assert best.registered.names == ("body1",) and "landmarks beside the scan" in best.failures[0]     # it has no limbs
     assert not any(task.landmarks for task in find_scans(scans, "none"))
-    near = prepare(tasks, template, {}, tmp_path / "near", pose)
+    near = prepare(tasks, template, MARKS, tmp_path / "near", pose)
     assert [f.init for f in near.figures] == ["pose", "pose"] and np.isnan(near.figures[0].landmarks)
 
 

@@ -17,6 +17,7 @@ from ..batch.pool import Workers
 from ..batch.workspace import Task, Workspace
 from ..dataset import RegisteredSet, SetEntry, read_entries, write_set
 from ..geometry.landmarks import write_landmarks
+from ..geometry.members import ONE_BODY, check_members
 from ..geometry.mesh import Mesh, check_template
 from ..judgement import Judgement
 from ..judgement import size as size_of
@@ -275,8 +276,9 @@ def _write_skeleton(space: Workspace, config: PrepareConfig, progress: Progress 
     meshes = [space.folder / entry.file for entry in registered.entries if entry.subject == subject]
 
     def find(folder: Path) -> None:
-        """Find the skeleton and write it."""
-        find_skeleton(registered.template, registered.poses(subject), config.skeleton,
-                      progress=progress).save(folder / path.name)
+        """Find the skeleton and write it; ValueError for a scan that is no pose of this body, by its name."""
+        poses = registered.poses(subject)
+        check_members(registered.template, poses, f"scans of {subject}", registered.names_of(subject), ONE_BODY)
+        find_skeleton(registered.template, poses, config.skeleton, progress=progress).save(folder / path.name)
 
     space.step("skeleton", (registered.template, meshes, config.skeleton), find)
