@@ -1,10 +1,11 @@
 """Notes every file that scapekit opens for writing without having made it: a link there would lead anywhere."""
 import os
 import sys
+from importlib.util import find_spec
 from pathlib import Path
 
-ROOT = Path(__file__).parents[1]
-OURS = tuple(str(ROOT / name) + os.sep for name in ("scanprep", "model", "completion"))
+# where the packages are: in this folder, or installed
+OURS = tuple(find_spec(name).submodule_search_locations[0] + os.sep for name in ("scanprep", "model", "completion"))
 WRITES = os.O_WRONLY | os.O_RDWR | os.O_CREAT | os.O_TRUNC | os.O_APPEND
 
 
