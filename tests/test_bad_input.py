@@ -215,3 +215,11 @@ def test_a_scan_of_any_name_is_taken(place, capsys, name):
     assert main(["prep", "clean", "-o", "out.ply", "--", f"{name}.ply"]) == 0
     assert main(["prep", "clean", f"{name}.ply", "-o", "more.ply"]) == (2 if name[0] == "-" else 0)
     assert name[0] != "-" or f"write ./{name}.ply" in capsys.readouterr().err
+
+
+def test_a_result_never_replaces_the_file_it_is_made_of(place, capsys):
+    assert main("prep fill template.ply -o out.ply".split()) == 0
+    before = (place / "out.ply").read_bytes()
+    assert main("prep decimate out.ply --faces 100 -o out.ply".split()) == 2
+    assert "--output: expected another file than out.ply, which is read" in capsys.readouterr().err
+    assert (place / "out.ply").read_bytes() == before
