@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from exclusive_writes import OURS
 from test_bad_input import ANIMATE, COMPLETE, LEARN, MOSH, PREP, place  # noqa: F401 -- a fixture
 from test_scanprep_pipeline_mend import ENDING, made, sent  # noqa: F401 -- a fixture
 from test_scanprep_pipeline_mend import place as mended  # noqa: F401 -- a fixture
@@ -163,3 +164,14 @@ def test_half_a_copy_is_none(tmp_path):
     assert [path.name for path in tmp_path.iterdir()] == ["a.txt"]
     storage.keep_former(tmp_path / "a.txt")
     assert (tmp_path / "a.txt.before").read_text() == "0 0 0 head\n"
+
+
+def test_what_is_opened_without_having_been_made_is_noticed(tmp_path, listener):
+    """Or the check of every test would prove nothing: a file that was there, written by a line of our code."""
+    (tmp_path / "theirs").write_text("")
+    for name, wrong in (("theirs", 1), ("new", 2)):
+        exec(compile(f"open({str(tmp_path / name)!r}, 'w').close()", f"{OURS[0]}line.py", "exec"))
+        assert len(listener.wrong) == wrong and name in listener.wrong[-1]
+    listener.wrong.clear()
+    storage.write_file(tmp_path / "theirs", "ours")
+    assert not listener.wrong

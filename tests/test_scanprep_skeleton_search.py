@@ -118,14 +118,19 @@ def test_tied_labels_are_mirror_images(animal, poses):
     assert mirror_pairs(pairs, partner).tolist() == [1, 0]
 
 
+def mirrored_sheet(n):
+    """A sheet of squares of one metre, n vertices a side, with its mirror image; and the faces of one side."""
+    x, y = (g.ravel() for g in np.meshgrid(np.arange(n), np.arange(n), indexing="ij"))
+    corner = np.flatnonzero((x < n - 1) & (y < n - 1))
+    side = np.stack([corner, corner + n, corner + n + 1, corner, corner + n + 1, corner + 1], 1).reshape(-1, 3)
+    number = np.where(x == 0, np.arange(n * n), np.arange(n * n) + n * n - n)         # of the mirrored vertices
+    return Mesh(np.concatenate([np.stack([x, y, 0 * x], 1), np.stack([-x, y, 0 * x], 1)[x > 0]]).astype(float),
+                np.concatenate([side, number[side][:, ::-1]])), side
+
+
 def test_tied_labels_stay_connected_where_triangles_are_not_paired_one_to_one():
     """A triangle of the right side whose partner lies in another part takes the part that surrounds it."""
-    x, y = (g.ravel() for g in np.meshgrid(np.arange(7), np.arange(7), indexing="ij"))
-    corner = np.flatnonzero((x < 6) & (y < 6))
-    side = np.stack([corner, corner + 7, corner + 8, corner, corner + 8, corner + 1], 1).reshape(-1, 3)
-    number = np.where(x == 0, np.arange(49), np.arange(49) + 42)             # of the mirrored vertices
-    sheet = Mesh(np.concatenate([np.stack([x, y, 0 * x], 1), np.stack([-x, y, 0 * x], 1)[x > 0]]).astype(float),
-                 np.concatenate([side, number[side][:, ::-1]]))
+    sheet, side = mirrored_sheet(7)
     F, at = len(side), np.abs(sheet.corners.mean(axis=1))
     near = (at[:, 0] < 3).astype(np.int64)                                    # 1 at the plane of symmetry, else 0
     label = np.where(np.arange(2 * F) < F, 0, 2) + near
@@ -144,12 +149,7 @@ def test_borders_of_one_side_stand_for_those_of_both():
     """What a symmetric labelling costs on the side that is labelled is what it costs on the whole: a sheet in squares
     of one metre, with borders of 7 m on either side and of 3 m on the plane; in the middle one part reaches over it.
     """
-    x, y = (g.ravel() for g in np.meshgrid(np.arange(5), np.arange(5), indexing="ij"))
-    corner = np.flatnonzero((x < 4) & (y < 4))
-    side = np.stack([corner, corner + 5, corner + 6, corner, corner + 6, corner + 1], 1).reshape(-1, 3)
-    number = np.where(x == 0, np.arange(25), np.arange(25) + 20)             # of the mirrored vertices
-    sheet = Mesh(np.concatenate([np.stack([x, y, 0 * x], 1), np.stack([-x, y, 0 * x], 1)[x > 0]]).astype(float),
-                 np.concatenate([side, number[side][:, ::-1]]))
+    sheet, side = mirrored_sheet(5)
     F = len(side)
     left, image = np.arange(2 * F) < F, sheet.vertices * [-1, 1, 1]
     symmetry = Symmetry(np.array([1.0, 0, 0]), np.zeros(3), (np.arange(2 * F) + F) % (2 * F), left, 0.0, 1.0, image)
