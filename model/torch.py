@@ -22,6 +22,8 @@ import torch
 from scipy.sparse import csr_array
 from torch import Tensor, nn
 
+from scanprep.geometry import storage
+
 from .bilinear import ShapedPoints
 from .blended import Blended, ShapedBlended
 from .body import BodyModel
@@ -523,6 +525,7 @@ def write_onnx(layer: BodyLayer, path: str | Path) -> None:
     if not layer.n_betas:
         del inputs["betas"]
     count = torch.export.Dim("B")
-    torch.onnx.export(layer, (), str(path), kwargs=inputs, input_names=list(inputs), dynamo=True, verbose=False,
-                      external_data=False, output_names=["vertices", "joints"],
-                      dynamic_shapes={name: {0: count} for name in inputs})
+    with storage.writing(path) as beside:
+        torch.onnx.export(layer, (), str(beside), kwargs=inputs, input_names=list(inputs), dynamo=True, verbose=False,
+                          external_data=False, output_names=["vertices", "joints"],
+                          dynamic_shapes={name: {0: count} for name in inputs})
