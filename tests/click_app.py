@@ -34,9 +34,8 @@ class Clicks:
 
     title, name = "Clicks <of> a test", "pick"
 
-    def __init__(self, *folders):
-        self.folders = folders
-        self.seen, self.numbers, self.files, self.closed = [], [], [], 0
+    def __init__(self):
+        self.seen, self.numbers = [], []
         self.busy, self.go, self.ended = threading.Event(), threading.Event(), threading.Event()
 
     def greet(self):
@@ -64,23 +63,15 @@ class Clicks:
             self.seen.append(message.fields.get("n"))
             send(Message("state", {"clicks": len(self.seen), "n": message.fields.get("n")}, message.data))
 
-    def receive(self, name, path, send):
-        if path.suffix != ".ply":
-            raise ValueError(f"{path}: expected a mesh")
-        self.files.append((name, path.name, path.read_bytes(), path))
-        send(Message("received", {"name": name}))
-
-    def close(self):
-        self.closed += 1
-
 
 @contextlib.contextmanager
 def clicking(app):
     """Its server; `told` has what the terminal was told."""
     told = []
-    script = START % CONNECTION.read_text(encoding="utf-8").replace("export function", "function")
-    with Server(app, say=told.append, script=script, style="body { color: navy }") as server:
-        server.told = told
+    server = Server(app, say=told.append)
+    server.script = START % CONNECTION.read_text(encoding="utf-8").replace("export function", "function")
+    server.told = told
+    with server:
         yield server
         app.go.set()
 
@@ -94,12 +85,9 @@ def until(what, seconds=5.0):
 
 
 @pytest.fixture
-def app(tmp_path):
-    """An app of clicks that gives away a folder, beside which there is a secret."""
-    (tmp_path / "out").mkdir()
-    (tmp_path / "out" / "body.ply").write_bytes(b"ply of a body")
-    (tmp_path / "secret.txt").write_text("secret")
-    return Clicks(tmp_path / "out")
+def app():
+    """An app of clicks."""
+    return Clicks()
 
 
 @pytest.fixture

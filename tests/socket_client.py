@@ -1,18 +1,14 @@
-"""A client of the viewer's server on plain sockets, so that a test can send what no browser would."""
-import base64
+"""A page of the viewer's server without a browser, so that a test can send what no browser would."""
+import contextlib
 import http.client
-import os
-import socket
-import struct
+import threading
 
 from scanprep.viewer.messages import Message
-
-CLOSED = 8
 
 
 def ask(server, path="/", method="GET", body=None, token=True, **headers):
     """Status, headers and body of one request; headers are given with `_` for `-`."""
-    connection = http.client.HTTPConnection("127.0.0.1", server.port, timeout=5)
+    connection = http.client.HTTPConnection("127.0.0.1", server.port, timeout=30)
     if token:
         headers.setdefault("Cookie", f"{server.gate.cookie}={server.gate.token}")
     try:
@@ -23,55 +19,37 @@ def ask(server, path="/", method="GET", body=None, token=True, **headers):
         connection.close()
 
 
-class Tab:
-    """One websocket; `status` of the handshake is 101 where it was let in."""
+class Page:
+    """One page; `turn` is the number of its connection."""
 
-    def __init__(self, server, tab="raw-tab-1", origin="", host="", token=None):
-        host = host or f"127.0.0.1:{server.port}"
-        token = server.gate.token if token is None else token
-        self.socket = socket.create_connection(("127.0.0.1", server.port), timeout=5)
-        lines = [f"GET /socket?tab={tab}&token={token} HTTP/1.1", f"Host: {host}", "Upgrade: websocket",
-                 "Connection: Upgrade", f"Sec-WebSocket-Key: {base64.b64encode(os.urandom(16)).decode()}",
-                 "Sec-WebSocket-Version: 13", f"Origin: {origin or f'http://{host}'}"]
-        self.socket.sendall(("\r\n".join(lines) + "\r\n\r\n").encode())
-        self.stream = self.socket.makefile("rb")
-        self.status = int(self.stream.readline().split()[1])
-        while self.stream.readline() not in (b"\r\n", b""):
-            pass
+    def __init__(self, server, name="raw-page", turn=0):
+        self.server, self.name, self.turn, self.greeted = server, name, turn, False
 
-    def __enter__(self):
-        return self
+    def post(self, path, body=b"", query="", **headers):
+        """Status, headers and body of one request of the page."""
+        headers = {"Origin": f"http://127.0.0.1:{self.server.port}", **headers}
+        return ask(self.server, f"{path}?page={self.name}&turn={self.turn}{query}", "POST", body, **headers)
 
-    def __exit__(self, *exc):
-        self.stream.close()
-        self.socket.close()
+    def send(self, kind, number, **fields):
+        """Send a message; the status of the answer."""
+        return self.post("/message", Message(kind, fields, number=number).pack())[0]
 
-    def send(self, kind, number=0, latest="", **fields):
-        """Send a message."""
-        self.send_raw(Message(kind, fields, latest=latest, number=number).pack())
+    def send_aside(self, kind, number, **fields):
+        """Send a message that takes long, in a thread; a server that ends meanwhile does not answer."""
+        def send():
+            with contextlib.suppress(OSError, http.client.HTTPException):
+                self.send(kind, number, **fields)
 
-    def send_raw(self, data, opcode=2, length=None):
-        """Send bytes in a frame that promises `length` of them."""
-        head = struct.pack("!BBQ", 0x80 | opcode, 0x80 | 127, len(data) if length is None else length)
-        self.socket.sendall(head + bytes(4) + data)
+        threading.Thread(target=send, daemon=True).start()
 
-    def frame(self):
-        """Kind and bytes of the next frame; (8, b"") where the connection ended."""
-        try:
-            head = self.stream.read(2)
-            if len(head) < 2:
-                return CLOSED, b""
-            size = head[1]
-            if size > 125:
-                size = int.from_bytes(self.stream.read(2 if size == 126 else 8), "big")
-            return head[0] & 15, self.stream.read(size)
-        except ConnectionError:
-            return CLOSED, b""
+    def next(self):
+        """The next message; the status of the answer where there is none. The first request asks to be greeted."""
+        status, _, body = self.post("/messages", query="" if self.greeted else "&greet=1")
+        self.greeted = True
+        return Message.unpack(body) if body else status
 
     def receive(self, kind):
         """The next message of this kind; others are passed over."""
-        while True:
-            opcode, data = self.frame()
-            assert opcode != CLOSED, f"the connection ended before a message {kind}"
-            if opcode == 2 and (message := Message.unpack(data)).kind == kind:
-                return message
+        while (message := self.next()).kind != kind:
+            pass
+        return message

@@ -1,16 +1,15 @@
-"""Messages between tabs and program: no click is lost or done twice, and newer moves replace older ones."""
+"""Messages between page and program: no click is lost or done twice, and newer answers replace older ones."""
 import math
 import struct
-import time
+import threading
 
 import numpy as np
 import pytest
-from click_app import refused_in_one_line, until
-from socket_client import CLOSED, Tab, ask
+from click_app import refused_in_one_line
+from socket_client import Page, ask
 
-from scanprep.viewer import handlers, tabs
 from scanprep.viewer.messages import Message
-from scanprep.viewer.waiting import Waiting
+from scanprep.viewer.server import LARGEST_MESSAGE
 
 
 @pytest.mark.parametrize("message", [
@@ -49,120 +48,98 @@ def test_bad_frames_say_what_was_expected(raw, why):
         Message.unpack(raw)
 
 
-def test_newer_messages_replace_older_ones_but_overtake_no_click():
-    waiting = Waiting()
-    for item in ("pose 1", "shape 1", "pose 2", "click", "pose 3", "pose 4"):
-        waiting.put(item, "" if item == "click" else item.split()[0])
-    assert [waiting.take()[1] for _ in range(len(waiting))] == ["pose 2", "shape 1", "click", "pose 4"]
+def opened(server, name="raw-page", turn=0):
+    """A page that was greeted."""
+    page = Page(server, name, turn)
+    page.receive("state")
+    return page
 
 
-def test_a_tab_is_greeted_and_all_tabs_are_told(server, app):
-    with Tab(server, "first-tab") as first, Tab(server, "second-tab") as second:
-        assert first.receive("state").data == b"\x01\x02"
-        assert second.receive("state").fields == {"clicks": 0}
-        first.send("click", 1, n=5)
-        assert first.receive("state").fields == second.receive("state").fields == {"clicks": 1, "n": 5}
-        with Tab(server, "third-tab") as third:
-            assert third.receive("state").fields == {"clicks": 1}
+def test_a_page_is_greeted_and_told_what_changes(server):
+    page = Page(server)
+    greeting = page.receive("state")
+    assert greeting.fields == {"clicks": 0} and greeting.data == b"\x01\x02"
+    page.send("click", 1, n=5)
+    assert page.receive("state").fields == {"clicks": 1, "n": 5}
+
+
+def test_a_second_page_takes_the_place_of_the_first(server, app):
+    first = opened(server)
+    answers = []
+    waiting = threading.Thread(target=lambda: answers.append(first.next()))
+    waiting.start()
+    second = opened(server, "second-page")
+    waiting.join(5)
+    assert answers == [409] and first.next() == 409 and first.send("click", 1, n=1) == 409
+    assert second.send("click", 1, n=2) == 200 and app.seen == [2]
+    again = opened(server)                                  # it was loaded again
+    assert again.send("click", 1, n=3) == 200 and second.next() == 409
 
 
 def test_a_page_loads_while_a_job_runs(server, app):
-    with Tab(server, "first-tab") as first:
-        first.send("work")
-        assert app.busy.wait(5)
-        with Tab(server, "second-tab") as second:
-            assert second.receive("state").fields == {"clicks": 0}
-        assert ask(server)[0] == 200
+    first = opened(server)
+    first.send_aside("work", 1)
+    assert app.busy.wait(5)
+    assert ask(server)[0] == 200
+    assert Page(server, "second-page").receive("state").fields == {"clicks": 0}
+    app.go.set()
 
 
-def test_of_moves_that_wait_only_the_newest_is_handled(server, app):
-    with Tab(server) as tab:
-        tab.receive("state")         # the greeting, which may come after the first acknowledgements
-        tab.send("work")
-        assert app.busy.wait(5)
-        for n in range(1, 6):
-            tab.send("move", n, latest="pose", n=n)
-        while tab.receive("acknowledged").fields["number"] < 5:
-            pass
-        app.go.set()
-        assert tab.receive("state").fields == {"clicks": 1, "n": 5}
-    assert app.seen == [5]
-
-
-def test_a_slow_tab_gets_the_newest_and_no_other_waits_for_it(server):
-    with Tab(server, "slow-tab") as slow, Tab(server, "fast-tab") as fast:
-        slow.receive("state"), fast.receive("state")
-        for n in range(60):
-            server.send(Message("mesh", {"n": n}, bytes(2**20), latest="mesh"))
-            if n % 20 == 0:
-                assert fast.receive("mesh").fields["n"] <= n
-        while fast.receive("mesh").fields["n"] < 59:
-            pass
-        numbers = [slow.receive("mesh").fields["n"]]
-        while numbers[-1] < 59:
-            numbers.append(slow.receive("mesh").fields["n"])
-    assert numbers == sorted(numbers) and len(numbers) < 40
-
-
-@pytest.mark.parametrize("pause", [0.0, 0.01])
-def test_a_tab_that_reads_nothing_is_closed(server, monkeypatch, pause):
-    monkeypatch.setattr(tabs, "LONGEST_QUEUE", 2**24)
-    with Tab(server) as tab:
-        tab.receive("state")
-        for _ in range(80):          # the buffers of the sockets hold tens of megabytes
-            server.send(Message("mesh", data=bytes(2**20)))
-            time.sleep(pause)
-        until(lambda: len(server.tabs) == 0, 2)      # at once, not when the protocol has waited 5 s for an answer
+def test_a_page_that_reads_slowly_gets_the_newest_of_each_kind(server):
+    page = opened(server)
+    for n in range(500):                                    # half a gigabyte, if all of them waited
+        server.send(Message("positions", {"n": n}, bytes(2**20), latest=f"positions {n % 2}"))
+        server.send(Message("state", {"n": n}))
+    assert [page.next().fields["n"] for _ in range(3)] == [498, 499, 499]
 
 
 def test_what_was_taken_in_is_not_handled_again_after_a_lost_connection(server, app):
-    with Tab(server) as tab:
-        tab.send("click", 1, n="a")
-        tab.send("click", 2, n="b")
-        until(lambda: len(app.seen) == 2)
-    with Tab(server) as again:
-        assert again.receive("acknowledged").fields == {"number": 2}
-        assert again.receive("state").fields == {"clicks": 2}
-        again.send("click", 2, n="b")
-        again.send("click", 3, n="c")
-        assert again.receive("state").fields == {"clicks": 3, "n": "c"}
-    with Tab(server, "another-tab") as other:
-        other.send("click", 1, n="d")
-        until(lambda: len(app.seen) == 4)
+    page = opened(server)
+    page.send("click", 1, n="a")
+    page.send("click", 2, n="b")
+    again = Page(server, turn=1)
+    assert again.receive("state").fields == {"clicks": 2}
+    again.send("click", 2, n="b")
+    again.send("click", 3, n="c")
+    assert app.seen == ["a", "b", "c"] and page.next() == 409
+    opened(server, "another-page").send("click", 1, n="d")
     assert app.seen == ["a", "b", "c", "d"]
 
 
-@pytest.mark.parametrize(("data", "opcode", "length"), [
-    (b"", 2, 2**24 + 1), (b"", 2, 2**62), (b"\x00", 2, None), (b"hello", 1, None)])
-def test_messages_that_are_too_large_or_damaged_end_the_connection(server, app, data, opcode, length):
-    with Tab(server) as tab:
-        tab.receive("state")
-        tab.send_raw(data, opcode, length)
-        assert tab.frame()[0] == CLOSED
-        assert refused_in_one_line(server, 101, tab.status)
-    assert ask(server)[0] == 200 and not app.seen
+def test_an_answer_that_the_lost_connection_waits_for_goes_to_the_new_one(server):
+    page = opened(server)
+    waiting = threading.Thread(target=page.next)
+    waiting.start()
+    again = opened(server, turn=1)
+    server.send(Message("news"))
+    waiting.join(5)
+    assert again.receive("news")
+
+
+@pytest.mark.parametrize("data", [b"\x00", b"hello"])
+def test_damaged_messages_are_refused(server, app, data):
+    page = opened(server)
+    assert refused_in_one_line(server, 400, page.post("/message", data)[0])
+    assert page.send("click", 1) == 200 and len(app.seen) == 1
 
 
 def test_a_message_of_the_largest_size_is_taken(server, app):
-    with Tab(server) as tab:
-        empty = Message("click", {"n": 1})
-        tab.send_raw(Message("click", {"n": 1}, bytes(handlers.LARGEST_MESSAGE - len(empty.pack()))).pack())
-        until(lambda: app.seen == [1])
+    message = Message("click", {"n": 1}, number=1)
+    full = Message("click", {"n": 1}, bytes(LARGEST_MESSAGE - len(message.pack())), number=1)
+    assert opened(server).post("/message", full.pack())[0] == 200 and app.seen == [1]
 
 
 def test_errors_of_the_app_are_shown_and_unforeseen_ones_told_once(server, app):
-    with Tab(server) as tab:
-        tab.send("wrong")
-        assert tab.receive("error").fields == {"text": "no such landmark"}
-        assert not server.told
-        tab.send("broken")
-        tab.send("broken")
-        for _ in range(2):
-            assert tab.receive("error").fields == {"text": "unexpected KeyError: 'crown'"}
-        trace, = server.told
-        assert "Traceback" in trace and "KeyError" in trace
-        tab.send("click", n=1)
-        until(lambda: app.seen == [1])
+    page = opened(server)
+    page.send("wrong", 1)
+    assert page.receive("error").fields == {"text": "no such landmark"}
+    assert not server.told
+    for number in (2, 3):
+        page.send("broken", number)
+        assert page.receive("error").fields == {"text": "unexpected KeyError: 'crown'"}
+    trace, = server.told
+    assert "Traceback" in trace and "KeyError" in trace
+    assert page.send("click", 4, n=1) == 200 and app.seen == [1]
 
 
 def test_a_greeting_that_fails_is_told_and_clicks_go_on(server, app):
@@ -170,8 +147,6 @@ def test_a_greeting_that_fails_is_told_and_clicks_go_on(server, app):
         raise ValueError("anna.ply: no triangles")
 
     app.greet = greet
-    with Tab(server) as tab:
-        tab.send("click", 1, n=1)
-        assert tab.receive("acknowledged")
-        assert tab.receive("error").fields == {"text": "anna.ply: no triangles"}
-        until(lambda: app.seen == [1])
+    page = Page(server)
+    assert page.receive("error").fields == {"text": "anna.ply: no triangles"}
+    assert page.send("click", 1, n=1) == 200 and app.seen == [1]

@@ -58,13 +58,13 @@ def complete_scan(scans: ScansArg = (), *, output: Output, model: ModelOrNone = 
         unit: Unit of the scan and landmarks; "unknown": it is found together with the body.
         up: The axis of the scan that points up, where it is known: people mostly stand. Of a depth camera that stands
             upright it is -y, written --up=-y, of one upside down y.
-        interactive: In the browser: click landmarks, complete, look at the body from all sides, correct, save. A scan
-            can also be dropped on the page. A recording of markers, named or dropped, tells which ones to click. Of a
-            folder, the results that are in the output are opened, worst first.
+        interactive: In the browser: click landmarks, complete, look at the body from all sides, correct, save. A
+            recording of markers beside the scan tells which ones to click. Of a folder, the results that are in the
+            output are opened, worst first.
         config: Settings.
         workers: Who completes the scans of a folder.
     """
-    if not scans and not interactive:
+    if not scans:
         raise UsageError("SCAN: expected at least one scan, or a folder of scans")
     # two flags that are settings
     if unit == "unknown":
@@ -123,6 +123,8 @@ def _in_browser(scans: tuple[Path, ...], output: Path, model: Path | None, subje
     labels = [label for path in scans for label in labels_of(path)]
     scans = tuple(path for path in scans if not is_recording(path))
     files = [path for one in scans for path in ([task.scan for task in find_scans(one)] if one.is_dir() else [one])]
+    if not files:
+        raise UsageError("SCAN: expected at least one scan beside the recordings of markers")
     app = CompleteApp(loaded, CompletionTask(body_of(loaded, subject, unit), name, marks, config, unit), files, output,
                       labels)
     serve(app)

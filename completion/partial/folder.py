@@ -3,13 +3,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import ClassVar
 
 import numpy as np
 
 from model.body import BodyModel
 from scanprep.arguments import UsageError
-from scanprep.batch.calls import KeptCall
 from scanprep.batch.pool import Workers
 from scanprep.batch.workspace import Results, Task, Workspace
 from scanprep.cli import Unit
@@ -25,11 +23,9 @@ from .work import EXPLAINED, MEANS, CompletionInputs, CompletionTask
 
 
 @dataclass(frozen=True)
-class FolderCall(KeptCall):
+class FolderCall:
     """The arguments of `scape complete` for a folder of scans."""
 
-    command: ClassVar[str] = "scape complete"
-    may_be_files: ClassVar[tuple[str, ...]] = ("subject",)
     scans: Path
     model: Path | None = None
     landmarks: Path | None = None
@@ -68,7 +64,7 @@ class FolderCall(KeptCall):
             ("scan",), "{} completed", summary, lambda rows: -figure(rows, EXPLAINED),
             {"complete": self.config, "model": model},
             hint="To mend some, run the same command with --interactive: it opens these results in the browser, worst "
-            f"first (scape complete {self.scans} ... -o {output} --interactive).", call=self)
+            f"first (scape complete {self.scans} ... -o {output} --interactive).")
 
 
 def summary(results: Results, count: int) -> list[Metric]:

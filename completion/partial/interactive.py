@@ -22,7 +22,6 @@ from scanprep.geometry.mesh import Mesh
 from scanprep.pictures.scene import Pane
 from scanprep.viewer.app import Send
 from scanprep.viewer.clicked import Clicked
-from scanprep.viewer.dropped import Dropped, with_camera
 from scanprep.viewer.landmark_names import next_name
 from scanprep.viewer.messages import Message
 from scanprep.viewer.pick import PickApp
@@ -73,8 +72,6 @@ class CompleteApp(PickApp):
         Folder for the results, with a folder for each of several scans.
     labels : strings, optional
         Markers on the person, which can be clicked too.
-    dropped : Dropped, optional
-        Keeps scans that are dropped on the page; without it the app keeps them until it closes.
     """
 
     COMPLETED = "completed.ply"
@@ -88,9 +85,8 @@ class CompleteApp(PickApp):
     name, title = "complete", "Complete a scan"
 
     def __init__(self, model: BodyModel, work: CompletionTask, scans: Sequence[Path], output: Path,
-                 labels: Sequence[str] = (), dropped: Dropped | None = None) -> None:
+                 labels: Sequence[str] = ()) -> None:
         self.model, self.work, self.output = model, work, output
-        self.dropped = dropped or Dropped()
         self._read: dict[Path, ScanFiles | DepthPicture] = {}
         self.made: dict[Path, Made] = {}
         self.saved: dict[Path, Path] = {}
@@ -101,13 +97,16 @@ class CompleteApp(PickApp):
         marks = far_apart_first({name: model.template.vertices[vertex] for name, vertex in work.marks.items()})
         super().__init__(template, [self._load_clicked(path) for path in scans], labels, fixed=marks)
 
+    @property
+    def scan(self) -> Clicked:
+        """Return the scan that is shown."""
+        return self.scans[self.current]
+
     def _load_clicked(self, path: Path) -> Clicked:
-        """Load a scan; landmarks of a dropped scan are saved with the results."""
-        file = self.output / (name_of(path) + ENDING) if self.dropped.holds(path) else None
-        one = Clicked.load(path, ENDING, self.work.unit, file if file and file.exists() else None)
-        one.file = file or one.file
-        one.surface = self._surface(path)
-        return one
+        """Load a scan with its landmarks."""
+        body = Clicked.load(path, ENDING, self.work.unit)
+        body.surface = self._surface(path)
+        return body
 
     def _load_input(self, path: Path) -> ScanFiles | DepthPicture:
         """Read a file when it is first needed, and keep the content."""
@@ -136,16 +135,14 @@ class CompleteApp(PickApp):
 
     def scene(self) -> Message:
         """Return the panes: the template, the scan, and the whole body once there is one."""
-        panes = [self.template.pane("the model")]
-        if self.scan is not None:
-            panes.append(self.scan_pane())
-            if (result := self._result_pane()) is not None:
-                panes.append(replace(result, label="the whole body"))
+        panes = [self.template.pane("the model"), self.scan_pane()]
+        if (result := self._result_pane()) is not None:
+            panes.append(replace(result, label="the whole body"))
         return self.pack(panes)
 
     def _result_pane(self) -> Pane | None:
         """Return the pane of the completed body, None before there is one."""
-        made = self.made.get(self.scan.path) if self.scan else None
+        made = self.made.get(self.scan.path)
         if made is None:
             return None
         return completion_panes(list(made.files.views), made.completion, self.model.template, made.masked)[-1]
@@ -157,11 +154,11 @@ class CompleteApp(PickApp):
 
     def more(self) -> dict[str, Any]:
         """Return figures and judgement of the completion, and which landmarks would help it."""
-        made = self.made.get(self.scan.path) if self.scan else None
-        markers = extra_markers(self.scan.places, self.work.marks) if self.scan else {}
+        made = self.made.get(self.scan.path)
+        markers = extra_markers(self.scan.places, self.work.marks)
         out: dict[str, Any] = {"known": self.known, "can_choose": self.can_choose, "completed": None,
                                "markers": len(markers), "fewest": self.FEWEST}
-        if made is None or self.scan is None:
+        if made is None:
             return out
         judgement, saved = made.completion.judgement, self.saved.get(self.scan.path)
         out["completed"] = {
@@ -173,13 +170,11 @@ class CompleteApp(PickApp):
 
     def _figures(self, made: Made) -> list[Metric]:
         """Return the rows of the closing table."""
-        assert self.scan is not None
         pairs = pairs_of(made.places, self.work.marks)
         return completion_figures(self.work, self._inputs(self.scan), made.completion, pairs, made.masked)
 
     def _is_outdated(self, made: Made) -> bool:
         """Tell whether landmarks or other inputs have changed since the completion."""
-        assert self.scan is not None
         now = {name: self.scan.places[name] for name in self._usable(self.scan)}
         return made.stale or made.known != self.known or set(now) != set(made.places) or any(
             not np.array_equal(now[name], made.places[name]) for name in now)
@@ -192,7 +187,7 @@ class CompleteApp(PickApp):
 
     def choose_next(self, last: str | None, pane: int = 1) -> None:
         """Choose the next name, a landmark of the model or a marker, that the scan lacks."""
-        done = set(self.scan.places) if self.scan else set()
+        done = set(self.scan.places)
         self.chosen = next_name(self.names, done, last) or last or next(iter(self.names), None)
 
     def on_choose(self, send: Send, name: str) -> None:
@@ -206,38 +201,9 @@ class CompleteApp(PickApp):
     def _join(self, labels: Sequence[str]) -> None:
         """Add labels of markers to the names that can be clicked."""
         self.names = tuple(dict.fromkeys([*self.names, *labels]))
-        done = self.scan.places if self.scan else {}
-        self.chosen = next((label for label in labels if label not in done), self.chosen)
+        self.chosen = next((label for label in labels if label not in self.scan.places), self.chosen)
 
     # what the page sends
-
-    def receive(self, name: str, path: Path, send: Send) -> None:
-        """Take a file that was dropped on the page: a scan is shown beside the others.
-
-        A recording of markers adds the labels of its markers, which can then be clicked on the scan.
-        """
-        with self.dropped.keeping(name, path) as kept:
-            labels = labels_of(kept)
-            scan, lacks = (kept, "") if labels else with_camera(kept)
-            if labels:
-                self._join(labels)
-            elif not lacks:
-                self.take(scan)
-                send(self.scene())
-        self.note = lacks or ("" if labels else f"{scan.name} is open")
-        send(self.state())
-
-    def take(self, path: Path) -> None:
-        """Show one more scan, or read a scan again in its place."""
-        self._read.pop(path, None)
-        one = self._load_clicked(path)
-        _ = one.shown                                            # what cannot be shown is refused
-        with self._lock:
-            known = [i for i, other in enumerate(self.scans) if other.path == path]
-            self.current, self.opened = known[0] if known else len(self.scans), self.opened + 1
-            self.scans[self.current:self.current + 1] = [one]
-            self.made.pop(path, None)
-            self.choose_next(None)
 
     def _predict_if_time(self, send: Send, pane: int) -> None:
         """Do nothing: here the completion predicts landmarks."""
@@ -248,8 +214,6 @@ class CompleteApp(PickApp):
 
     def on_complete(self, send: Send, anew: bool = False) -> None:
         """Complete the scan, from the last result if that is meaningful; `anew` searches from scratch."""
-        if self.scan is None:
-            raise ValueError("drop a scan on the page first")
         if self.working is not None:
             return
         names = self._usable(self.scan)
@@ -278,7 +242,7 @@ class CompleteApp(PickApp):
 
     def on_doubt(self, send: Send) -> None:
         """Complete without the landmarks, to find those at wrong places."""
-        if self.scan is None or self.working is not None:
+        if self.working is not None:
             return
         scan, known, places = self.scan, self.known, {name: self.scan.places[name] for name in self._usable(self.scan)}
 
@@ -314,8 +278,8 @@ class CompleteApp(PickApp):
 
     def on_save(self, send: Send) -> None:
         """Write the files that `scape complete` writes."""
-        made = self.made.get(self.scan.path) if self.scan else None
-        if made is None or self.scan is None:
+        made = self.made.get(self.scan.path)
+        if made is None:
             raise ValueError("complete the scan first")
         self.working = ("saving", 0, 1)
         send(self.state())
@@ -345,7 +309,3 @@ class CompleteApp(PickApp):
         outcome = Outcome(folder, rows, {"complete": self.work.config}, judgement=made.completion.judgement)
         write_report(outcome, "scape complete --interactive", made.seconds)
         return rows
-
-    def close(self) -> None:
-        """Delete the files that were dropped."""
-        self.dropped.close()

@@ -1,6 +1,6 @@
 """Correct a folder of completions in the browser: worst first, move landmarks, complete again from the last result.
 
-Opened by `scape complete SCANS -o FOLDER --interactive`, or from the folder alone.
+Opened by `scape complete SCANS -o FOLDER --interactive`.
 """
 from __future__ import annotations
 
@@ -24,14 +24,6 @@ from .completion import Completion, load_completion
 from .folder import FolderCall
 from .interactive import ENDING, CompleteApp, Made
 from .work import CompletionInputs
-
-
-def mend_completions(folder: Path) -> CompletionsApp:
-    """Return the app for an output folder of `scape complete`; ValueError for a folder without its settings."""
-    call = FolderCall.read(folder)
-    app = CompletionsApp(call, folder)
-    app.outside = call.ask_outside(folder)
-    return app
 
 
 class CompletionsApp(ResultsApp, CompleteApp):
@@ -77,7 +69,6 @@ class CompletionsApp(ResultsApp, CompleteApp):
     def _bring(self) -> None:
         """Load the stored completion of the shown scan, if it belongs to this model."""
         scan = self.scan
-        assert scan is not None, "a folder of scans has some"
         if scan.path not in self.made and (folder := self.output / self._name_of[scan.path]).exists():
             try:
                 done = load_completion(folder)
@@ -108,7 +99,6 @@ class CompletionsApp(ResultsApp, CompleteApp):
     def scene(self) -> Message:
         """Return the scene of one scan, or only the template where the scan cannot be read."""
         scan = self.scan
-        assert scan is not None, "a folder of scans has some"
         try:
             if scan.surface is None:
                 scan.surface = self._surface(scan.path)
@@ -136,10 +126,6 @@ class CompletionsApp(ResultsApp, CompleteApp):
             self._bring()
             self.current = before
         super().on_open(send, scan)
-
-    def receive(self, name: str, path: Path, send: Send) -> None:
-        """Refuse files that are dropped on the page."""
-        raise ValueError(f"copy the scan into {self.call.scans}: all scans there are listed here")
 
     def _save(self, scan: Clicked, made: Made) -> None:
         """Write the files of the command, so that the scan counts as done there, and renew the folder's page."""

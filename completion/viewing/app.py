@@ -6,67 +6,73 @@ where all sliders stand. Newer answers replace older ones that still wait.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from scanprep.pictures.scene import pack_scene
-from scanprep.viewer.app import App, Send
-from scanprep.viewer.dropped import Dropped, with_camera
+from scanprep.viewer.app import Send
 from scanprep.viewer.messages import Message, call_action, find_action
 
 from .arrangement import arrange_side_by_side, over_each_other
+from .contents import Content
 from .controls import Controls, Shown
-from .files import Entry, Files
-from .pages import Inside
+from .files import Entry
+from .movable import MovableBody
 from .saving import save_bodies, save_poses
-from .things import MOST, Things
+from .statues import movable
 
-# messages of sliders, buttons and mouse that move bodies; the fields of a message are the arguments
+MOST = 12                            # things shown at a time: more are too small to see
+# messages of sliders and buttons that move bodies; the fields of a message are the arguments
 MOVES: Mapping[str, Callable[..., object]] = {
-    "beta": Controls.set_beta, "turn": Controls.set_turn, "choose": Controls.choose_part, "touch": Controls.choose,
-    "grab": Controls.grab, "drag": Controls.drag, "random_body": Controls.random_body,
-    "random_pose": Controls.random_pose, "reset": Controls.reset}
+    "beta": Controls.set_beta, "turn": Controls.set_turn, "choose": Controls.choose_part, "reset": Controls.reset}
 
 
-class ViewApp(Things):
-    """Things side by side, or over each other; ValueError where there are some and none can be read.
+class ViewApp:
+    """Things side by side, or over each other; ValueError where none can be read.
 
     Parameters
     ----------
     entries : sequence of Entry
-        What can be shown; none at first where files will be dropped.
+        What can be shown.
     over : bool
         Show all in one pane.
     output : Path
         Folder for what is saved.
-    files : Files, optional
-        The files that the entries are from; they recognise further files.
+
+    Attributes
+    ----------
+    shown : list of int
+        Numbers of the entries that are shown.
+    contents, bodies : dict
+        By number, contents of the shown things, and the bodies of those that are models.
+    problems, about : dict
+        By number, why a thing cannot be read; a description of one that was.
+    written : list of Path
+        Files that were saved.
     """
 
     name, title = "view", "View"
-    folders: Sequence[Path] = ()
 
-    def __init__(self, entries: Sequence[Entry] = (), over: bool = False, output: Path = Path(),
-                 files: Files | None = None) -> None:
-        super().__init__(entries, files or Files())
-        self.over, self.output = over, output
-        self.controls, self.dropped = Controls(), Dropped()
-        self.inside = Inside(self.files, output, self.dropped)
-        self.written: list[Path] = []                     # files that were saved
-        self.note = ""
-        self.working: tuple[str, int, int] | None = None
+    def __init__(self, entries: Sequence[Entry], over: bool = False, output: Path = Path()) -> None:
+        self.entries, self.over, self.output = list(entries), over, output
+        self.shown: list[int] = []
+        self.contents: dict[int, Content] = {}
+        self.bodies: dict[int, MovableBody] = {}
+        self.problems: dict[int, str] = {}
+        self.about: dict[int, str] = {}
+        self.written: list[Path] = []
+        self.controls = Controls()
         self.number = 0                                   # of the scene; positions carry it
         self._scene: list[Message] = []                   # messages that make up the scene
         self._notes: tuple[str, ...] = ()
         self._positions: dict[tuple[int, int], Message] = {}
-        if self.entries:
-            # show what is marked as first; of too many only the first one
-            first = [i for i, entry in enumerate(self.entries) if entry.first] or [0]
-            self.show(first if len(first) <= MOST else first[:1])
-            if not self.shown:
-                raise ValueError(next(iter(self.problems.values()), "FILES: nothing to show"))
+        # show what is marked as first; of too many only the first one
+        first = [i for i, entry in enumerate(self.entries) if entry.first] or [0]
+        if not self.show(first if len(first) <= MOST else first[:1]):
+            raise ValueError(next(iter(self.problems.values())))
 
     # what the page is sent
 
@@ -76,16 +82,12 @@ class ViewApp(Things):
 
     def state(self) -> Message:
         """Return everything but the shapes."""
-        sliders = self.controls
         return Message("state", {
             "entries": [{"name": entry.name, "shown": i in self.shown, "problem": self.problems.get(i, ""),
                          "about": self.about.get(i, "")} for i, entry in enumerate(self.entries)],
             "notes": list(self._notes), "problems": list(self.problems.values()),
-            "saved": [str(path) for path in self.written], "note": self.note, "working": self.working,
-            "pages": self.inside.list_buttons(self.entries),
-            "parts": list(sliders.turns), "models": [{"pane": one.pane, "layer": one.layer, "name": one.name}
-                                                     for one in sliders.shown],
-            **self._where()}, latest="state")
+            "saved": [str(path) for path in self.written], "parts": list(self.controls.turns), **self._where()},
+            latest="state")
 
     def _where(self) -> dict[str, Any]:
         """Return where all sliders stand."""
@@ -95,36 +97,37 @@ class ViewApp(Things):
 
     # what is shown
 
-    def show(self, wanted: Sequence[int]) -> None:
-        """Read entries and show them; for those that cannot be read the reason is kept."""
-        self.put(self.read(wanted))
+    def show(self, wanted: Sequence[int]) -> bool:
+        """Read entries and show them as a new scene; for those that cannot be read the reason is kept.
 
-    def put(self, read: Sequence[int]) -> None:
-        """Show what was read, as a new scene."""
-        super().put(read)
-        if read:
-            self._make_scene()
+        False where none can be read: then everything stays as it is.
+        """
+        if len(wanted) > MOST:
+            raise ValueError(f"at most {MOST} can be shown at a time")
+        contents: dict[int, Content] = {}
+        for i in wanted:
+            try:
+                contents[i] = self.contents[i] if i in self.contents else self._load(i)
+                model = contents[i].model
+                if model is not None and i not in self.bodies:
+                    self.bodies[i] = movable(model, contents[i].statue)
+            except (ValueError, OSError) as problem:
+                self.problems[i] = str(problem)
+            else:
+                self.problems.pop(i, None)
+        shown = [i for i in contents if i not in self.problems]
+        if not shown:
+            return False
+        self.shown, self.contents = shown, {i: contents[i] for i in shown}
+        self.bodies = {i: body for i, body in self.bodies.items() if i in shown}
+        self._make_scene()
+        return True
 
-    # pages inside
-
-    def enter(self, send: Send, wanted: Mapping[str, Any]) -> App:
-        """Open the page that a button asks for."""
-        def progress(done: int, total: int) -> None:
-            self.working = ("building the synthetic people", done, total)
-            send(self.state())
-
-        self.note = ""
-        try:
-            return call_action(self.inside.enter, wanted, self.entries, progress)
-        finally:
-            self.working = None
-
-    def on_return(self, app: App) -> None:
-        """Show what a page has written."""
-        for folder in self.inside.folders_written(app):
-            if folder not in self.files.folders(self.entries):
-                self.written.append(folder)
-            self.join(folder)
+    def _load(self, i: int) -> Content:
+        """Read an entry."""
+        content = self.entries[i].load()
+        self.about[i] = content.about
+        return replace(content, name=self.entries[i].name, stance=content.start or content.stance)
 
     def _make_scene(self) -> None:
         """Build panes and layers for everything shown, with residuals of markers and sliders of bodies."""
@@ -139,8 +142,10 @@ class ViewApp(Things):
             pane, layer = (0, below) if self.over else (number, 0)
             below += len(content.shapes)
             if (markers := content.markers) is not None:
-                fields = {"pane": pane, "layer": layer + markers.shape, "labels": markers.labels, **markers.colors()}
-                self._scene.append(Message("residuals", fields, markers.residuals.astype("<f4").tobytes()))
+                fields = {"scene": self.number, "pane": pane, "layer": layer + markers.shape, "labels": markers.labels,
+                          **markers.colors()}
+                self._scene.append(Message("residuals", fields, markers.residuals.astype("<f4").tobytes(),
+                                           f"residuals {pane} {layer}"))
             if i in self.bodies:
                 bodies += [Shown(body, content.name, pane, layer + k) for k, body in enumerate(self.bodies[i].layers)]
         self._notes = tuple(note for content in contents for note in content.notes)
@@ -163,7 +168,7 @@ class ViewApp(Things):
     # what the page sends
 
     def handle(self, message: Message, send: Send) -> None:
-        """Act on a slider, a button or a click."""
+        """Act on a slider or a button."""
         if (move := MOVES.get(message.kind)) is not None:
             call_action(move, message.fields, self.controls)
             for one in self.controls.shown:
@@ -171,28 +176,9 @@ class ViewApp(Things):
         else:
             call_action(find_action(self, message.kind), message.fields, send)
 
-    def receive(self, name: str, path: Path, send: Send) -> None:
-        """Show a file dropped on the page with the other things; ValueError for one that cannot be shown."""
-        with self.dropped.keeping(name, path) as copy:
-            complete, self.note = with_camera(copy)
-            if not self.note:
-                self.join(complete)
-        for message in self.greet():
-            send(message)
-
-    def close(self) -> None:
-        """Remove dropped files; everything else was saved."""
-        self.written += [folder for page in self.inside.completions for folder in self.inside.folders_written(page)]
-        self.dropped.close()
-
     def on_show(self, send: Send, entries: list[int]) -> None:
         """Show other things; if none can be read, keep the present ones."""
-        wanted = [i for i in dict.fromkeys(entries) if 0 <= i < len(self.entries)]
-        before = self.shown, self.contents, self.bodies
-        self.show(wanted)
-        if not self.shown:
-            self.shown, self.contents, self.bodies = before
-        else:
+        if self.show([i for i in dict.fromkeys(entries) if 0 <= i < len(self.entries)]):
             for message in [*self._scene, *self._positions.values()]:
                 send(message)
         send(self.state())

@@ -1,14 +1,12 @@
-"""Sliders of shape, pose and place, shared by all models that are shown."""
+"""Sliders of shape and pose, shared by all models that are shown."""
 from __future__ import annotations
 
 from dataclasses import dataclass, field
 
 import numpy as np
 
-from model.priors import LEAST_POSES, JointLimits, sample_poses
 from scanprep.ranges import BETAS, TURNS
 
-from .dragging import Drag
 from .movable import MovableBody
 
 
@@ -33,10 +31,7 @@ class Controls:
     shown: list[Shown] = field(default_factory=list)
     betas: np.ndarray = field(default_factory=lambda: np.zeros(0))
     turns: dict[str, np.ndarray] = field(default_factory=dict)
-    trans: np.ndarray = field(default_factory=lambda: np.zeros(3))
     chosen: str = ""                     # part whose angles are shown
-    held: tuple[Shown, Drag] | None = None
-    rng: np.random.Generator = field(default_factory=np.random.default_rng)
 
     def take(self, shown: list[Shown]) -> None:
         """Take other bodies; the sliders keep their values where the new bodies have them."""
@@ -45,7 +40,7 @@ class Controls:
         betas[:min(count, len(self.betas))] = self.betas[:count]
         names = dict.fromkeys(name for one in shown for name in one.body.parts)
         self.turns = {name: self.turns.get(name, np.zeros(3)) for name in names}
-        self.shown, self.betas, self.held = shown, betas, None
+        self.shown, self.betas = shown, betas
         if self.chosen not in names:
             self.chosen = next(iter(names), "")
 
@@ -59,7 +54,7 @@ class Controls:
 
     def vertices(self, body: MovableBody) -> np.ndarray:
         """Compute the vertices (N, 3) float32, metres, relative to the body's `origin`."""
-        return body.vertices(self.betas_of(body), self.pose_of(body), self.trans)
+        return body.vertices(self.betas_of(body), self.pose_of(body))
 
     # what sliders and buttons do
 
@@ -80,56 +75,12 @@ class Controls:
         TURNS.check(value, "pose")
         self.turns[part] = value
 
-    def random_body(self) -> None:
-        """Draw random betas, distributed like those of the training people."""
-        self.betas = self.rng.normal(size=len(self.betas))
-
-    def random_pose(self) -> None:
-        """Draw a pose from the pose prior of the first model, within the seen limits of its joints."""
-        if not self.shown:
-            return
-        body = self.shown[0].body
-        examples = body.model.pose_examples
-        limits = JointLimits.from_poses(examples) if len(examples) >= LEAST_POSES else None
-        pose = sample_poses(body.model, 1, self.rng, limits)[0]
-        pose[0] = 0
-        self.turns.update(zip(body.parts, pose, strict=True))
-        self.trans = np.zeros(3)
-
     def reset(self) -> None:
         """Return to the mean body at rest."""
         self.betas = np.zeros_like(self.betas)
         self.turns = {name: np.zeros(3) for name in self.turns}
-        self.trans = np.zeros(3)
-
-    # dragging
 
     def choose_part(self, part: str) -> None:
         """Choose the part whose angles are shown."""
         if part in self.turns:
             self.chosen = part
-
-    def choose(self, pane: int, layer: int, vertex: int) -> Shown:
-        """Choose the part that was clicked."""
-        one = next((one for one in self.shown if (one.pane, one.layer) == (pane, layer)), None)
-        if one is None:
-            raise ValueError(f"pane and layer: expected a model's body, got {pane}, {layer}")
-        if not 0 <= vertex < len(one.body.part_of_vertex):
-            raise ValueError(f"vertex: expected 0 to {len(one.body.part_of_vertex) - 1}, got {vertex}")
-        self.chosen = one.body.parts[int(one.body.part_of_vertex[vertex])]
-        return one
-
-    def grab(self, pane: int, layer: int, vertex: int) -> None:
-        """Grab a vertex."""
-        one = self.choose(pane, layer, vertex)
-        self.held = one, Drag(one.body, vertex, self.betas_of(one.body), self.pose_of(one.body))
-
-    def drag(self, target: list[float]) -> None:
-        """Drag the grabbed vertex towards a place (3,), metres."""
-        wanted = np.asarray(target, dtype=float)
-        if wanted.shape != (3,) or not np.isfinite(wanted).all():
-            raise ValueError(f"target: expected three finite numbers, got {target}")
-        if self.held is not None:
-            one, held = self.held
-            pose, self.trans = held.drag_to(self.pose_of(one.body), self.trans, wanted)
-            self.turns.update(zip(one.body.parts, pose, strict=True))

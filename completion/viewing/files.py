@@ -1,7 +1,7 @@
 """Recognise files and folders by their contents, and how each is shown."""
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -14,11 +14,10 @@ from model.motion.onto import read_motion
 from model.statue.files import ABOUT, CONTROL
 from scanprep.cli import Unit
 from scanprep.dataset import RegisteredSet
-from scanprep.depth_camera.picture import is_camera
+from scanprep.depth_camera.picture import CAMERA, is_camera
 from scanprep.geometry.files import read_mesh
 from scanprep.geometry.landmarks import landmarks_beside, read_landmarks
 from scanprep.viewer.clicked import read_shown_surface
-from scanprep.viewer.dropped import with_camera
 
 from ..mocap.files.markers import MarkerSequence
 from ..motion import Motion
@@ -35,18 +34,11 @@ COMPLETION, MOTION, SET = "completion.npz", "motion.npz", "set.json"
 
 @dataclass(frozen=True, eq=False)
 class Entry:
-    """A thing that can be shown; it is read only then.
-
-    `first`: shown at the start. `path`: what is read. `kind`: as `viewable_kind` returns it. `folder`: the folder of a
-    command that it belongs to.
-    """
+    """A thing that can be shown; it is read only then. `first`: shown at the start."""
 
     name: str
     load: Callable[[], Content]
     first: bool = True
-    path: Path = Path()
-    kind: str = ""
-    folder: Path | None = None
 
 
 class Files:
@@ -75,7 +67,7 @@ class Files:
                  over: bool = False, rate: float | None = None) -> None:
         self.paths, self.model, self.unit, self.over, self.rate = paths, model, unit, over, rate
         self._models: dict[Path, BodyModel] = {}
-        self.known: dict[str, tuple[Path, ...]] = {"model": (), "markers": ()}  # models and recordings among the files
+        self._known: dict[str, list[Path]] = {"model": [], "markers": []}      # models and recordings among the files
 
     def entries(self) -> list[Entry]:
         """List all things in order; ValueError for a missing file, or one that cannot be shown."""
@@ -84,8 +76,8 @@ class Files:
             if not path.exists():
                 raise ValueError(f"{path}: no such file or folder")
             if is_camera(path):                          # it is read with its picture
-                picture, lacks = with_camera(path)
-                if lacks:
+                picture = path.with_name(path.name[:-len(CAMERA)] + ".png")
+                if not picture.exists():
                     raise ValueError(f"{path}: expected its depth picture, {picture.name}, beside it; there is none")
                 if picture in self.paths:
                     continue
@@ -101,38 +93,6 @@ class Files:
         if len(entries) > 1 and all(entry.name.startswith(shared) for entry in entries):
             entries = [replace(entry, name=entry.name.removeprefix(shared)) for entry in entries]
         return entries
-
-    def with_another(self, entries: Sequence[Entry], path: Path) -> list[Entry]:
-        """Return the entries with those of one more file or folder, which replace earlier ones of the same path."""
-        self._models.pop(path.resolve(), None)
-        self.known = {kind: tuple(one for one in paths if one != path) for kind, paths in self.known.items()}
-        if path.name.lower().endswith(self.PLACES):
-            # landmarks: on the mesh that they lie beside, else on the last thing
-            changed = list(entries)
-            beside = [i for i, entry in enumerate(changed) if landmarks_beside(entry.path) == path]
-            if beside:
-                changed[beside[0]] = self._of_file(changed[beside[0]].path, changed[beside[0]].name)
-            else:
-                self._lay_on(changed, path)
-            return changed
-        fresh = self._of_folder(path) if path.is_dir() else [self._of_file(path, path.name)]
-        old = [i for i, entry in enumerate(entries) if path in (entry.path, *entry.path.parents)]
-        shared = f"{path.resolve().name}/"
-        if old and not entries[old[0]].name.startswith(shared):     # keep the names they had
-            fresh = [replace(entry, name=entry.name.removeprefix(shared)) for entry in fresh]
-        place = old[0] if old else len(entries)
-        return [*entries[:place], *fresh, *(entry for i, entry in enumerate(entries) if i > place and i not in old)]
-
-    def folders(self, entries: Sequence[Entry]) -> list[Path]:
-        """List folders written by commands that entries belong to, and folders that were named."""
-        of_commands = [entry.folder for entry in entries if entry.folder is not None]
-        return list(dict.fromkeys([*of_commands, *(path for path in self.paths if path.is_dir())]))
-
-    @property
-    def models(self) -> list[Path]:
-        """List the models among the files, and last the one named for motions."""
-        named = [] if self.model is None else [self.model]
-        return list(dict.fromkeys([*(path for path in self.known["model"] if path not in named), *named]))
 
     def read_model(self, path: Path) -> BodyModel:
         """Read a model, a file or the name of a built-in one, each once."""
@@ -155,9 +115,9 @@ class Files:
         if kind not in loads:
             raise ValueError(f"{path}: expected a mesh, points, markers, a model, a motion, landmarks, a depth picture "
                              f"or a folder, found {kind}")
-        if kind in self.known:
-            self.known = {**self.known, kind: (*self.known[kind], path)}
-        return Entry(name, loads[kind], kind != "markers" or not self.over, path, kind)
+        if kind in self._known:
+            self._known[kind].append(path)
+        return Entry(name, loads[kind], kind != "markers" or not self.over)
 
     def _surface(self, path: Path, name: str) -> Content:
         """Read a mesh or points with the landmarks beside them."""
@@ -199,17 +159,14 @@ class Files:
         if (folder / SET).is_file():
             yield from self._of_set(folder, name)
         elif (folder / ABOUT).is_file() and (folder / CONTROL).is_file():
-            yield Entry(name, lambda: read_statue(name, folder), True, folder, "statue", folder)
+            yield Entry(name, lambda: read_statue(name, folder))
         elif (folder / COMPLETION).is_file():
-            yield Entry(name, lambda: of_completion(name, load_completion(folder)), True, folder, "completion", folder)
+            yield Entry(name, lambda: of_completion(name, load_completion(folder)))
         elif (folder / MOTION).is_file():
-            yield Entry(name, lambda: collect_warnings(lambda: self._motion(folder / MOTION, name)), True,
-                        folder / MOTION,
-                        "motion", folder)
+            yield Entry(name, lambda: collect_warnings(lambda: self._motion(folder / MOTION, name)))
             if (folder / "onto.npz").is_file():
                 yield Entry(f"{name}, other person",
-                            lambda: collect_warnings(lambda: self._motion(folder / "onto.npz", name)),
-                            True, folder / "onto.npz", "motion", folder)
+                            lambda: collect_warnings(lambda: self._motion(folder / "onto.npz", name)))
         else:
             for path in sorted(folder.iterdir()):
                 if path.name.startswith("."):
@@ -231,10 +188,8 @@ class Files:
         for i, (scan, why) in enumerate(worst_first(registered)):
             path = folder / next(entry.file for entry in registered.entries if entry.name == scan)
             label = f"{name}/{scan}" + (f": {why}" if why else "")
-            yield Entry(label, lambda label=label, path=path: load(label, path), i == 0, path,  # type: ignore[misc]
-                        "of a set", folder)
-        yield Entry(f"{name}/template", lambda: load(f"{name}/template", folder / "template.ply"), False,
-                    folder / "template.ply", "of a set", folder)
+            yield Entry(label, lambda label=label, path=path: load(label, path), i == 0)  # type: ignore[misc]
+        yield Entry(f"{name}/template", lambda: load(f"{name}/template", folder / "template.ply"), False)
 
     # motions
 
@@ -271,7 +226,7 @@ class Files:
         """Find the recording of a motion: the mended one beside it, or one among the files, laid over it."""
         virtual = path.with_name("virtual.c3d")
         candidates = [(virtual, None)] if virtual.is_file() and path.name == MOTION else []
-        for file, unit in [*candidates, *((one, self.unit) for one in self.known["markers"] if self.over)]:
+        for file, unit in [*candidates, *((one, self.unit) for one in self._known["markers"] if self.over)]:
             markers = read_recording(file, unit, self.rate)
             # a recording of the same length that shares three labels or more
             if len(markers.positions) == len(motion.poses) and len({*markers.labels} & {*motion.labels}) >= 3:
@@ -286,8 +241,8 @@ class Files:
             name = model_of_report(folder / "report.json")
             if name is not None:
                 return self.read_model(name)
-        fitting = [m for m in map(self.read_model, self.known["model"])
+        fitting = [m for m in map(self.read_model, self._known["model"])
                    if motion is None or len(m.skeleton.parents) == motion.poses.shape[1]]
         if not fitting:
-            raise ValueError(f"{path}: a motion needs its model; name it with -m, or drop it before")
+            raise ValueError(f"{path}: a motion needs its model; name it with -m")
         return fitting[0]

@@ -11,7 +11,7 @@ from collections import OrderedDict
 import numpy as np
 
 from model.body import BodyModel
-from model.linear import PointOperator, combination_weights
+from model.linear import PointOperator
 from scanprep.geometry.mesh import Mesh
 from scanprep.skeleton.roles import in_words
 
@@ -32,7 +32,6 @@ class MovableBody:
     def __init__(self, model: BodyModel) -> None:
         self.model, self.skeleton = model, model.skeleton
         self.parts = tuple(map(in_words, model.skeleton.names))
-        self.part_of_vertex = model.skeleton.part_of_vertex(model.template)
         self.regressor = model.joint_regressor
         self.betas: np.ndarray | None = np.zeros(model.n_betas) if model.n_betas else None
         self.operator = model.operator(self.betas).astype(np.float32)
@@ -40,11 +39,11 @@ class MovableBody:
         self._pose = np.zeros((0, 3))
         self._products: dict[int, np.ndarray] = {}                # results at `_pose` by difference; -1 is the body
 
-    def vertices(self, betas: np.ndarray | None, pose: np.ndarray, trans: np.ndarray | None = None) -> np.ndarray:
+    def vertices(self, betas: np.ndarray | None, pose: np.ndarray) -> np.ndarray:
         """Compute the vertices (N, 3) float32, metres, relative to the root's joint.
 
-        Shape betas (K,) or None, pose (J, 3) radians, and trans (3,), which is added. Positions are relative to
-        `origin`, so that single precision keeps a few micrometres wherever the body is.
+        Shape betas (K,) or None, and pose (J, 3) radians. Positions are relative to `origin`, so that single precision
+        keeps a few micrometres wherever the body is.
         """
         moved = not np.array_equal(pose, self._pose)
         changed = self._find_changed(betas)
@@ -58,23 +57,12 @@ class MovableBody:
         for k in changed.tolist():
             assert betas is not None and self.betas is not None
             y += np.float32(betas[k] - self.betas[k]) * self._product(k)
-        if trans is not None:
-            y += trans.astype(np.float32)[:, None]
         return y.T
 
     @property
     def origin(self) -> np.ndarray:
-        """(3,) float, metres: where the root's joint is when trans is zero."""
+        """(3,) float, metres: where the root's joint is."""
         return self.skeleton.joints[0]
-
-    def point(self, vertex: int, betas: np.ndarray | None) -> PointOperator:
-        """Return one vertex of the body with these betas as a function of the pose."""
-        self._settle(betas)
-        return self.operator.combine(combination_weights(self.operator.count, *self._below(vertex))).astype(np.float64)
-
-    def _below(self, vertex: int) -> tuple[np.ndarray, np.ndarray | None]:
-        """Return the vertex of the model, in the form that `Subject.points` takes."""
-        return np.array([vertex]), None
 
     @property
     def layers(self) -> tuple[MovableBody, ...]:
@@ -85,9 +73,9 @@ class MovableBody:
         """Compute the joint of a part, (1, 3), from the latest vertices `y`."""
         return np.asarray(self.regressor[[self.parts.index(part)]] @ y)
 
-    def mesh(self, betas: np.ndarray | None, pose: np.ndarray, trans: np.ndarray) -> Mesh:
+    def mesh(self, betas: np.ndarray | None, pose: np.ndarray) -> Mesh:
         """Compute the body with the exact model."""
-        return self.model.template.with_vertices(self.model.vertices(pose, betas, trans))
+        return self.model.template.with_vertices(self.model.vertices(pose, betas))
 
     def _find_changed(self, betas: np.ndarray | None) -> np.ndarray | None:
         """Return which betas differ from the operator's; None where it is faster to compute it again."""

@@ -17,13 +17,13 @@ from .movable import MovableBody
 def save_bodies(controls: Controls, folder: Path) -> list[Path]:
     """Save every body that is shown as `NAME_body.ply`, computed with the exact model."""
     return _save(controls, folder, "body.ply", lambda path, body: write_mesh(
-        path, body.mesh(controls.betas_of(body), controls.pose_of(body), controls.trans)))
+        path, body.mesh(controls.betas_of(body), controls.pose_of(body))))
 
 
 def save_poses(controls: Controls, folder: Path) -> list[Path]:
-    """Save pose, place and shape of every body as `NAME_pose.npz`, a motion of one frame."""
+    """Save pose and shape of every body as `NAME_pose.npz`, a motion of one frame."""
     return _save(controls, folder, "pose.npz", lambda path, body: Motion(
-        controls.pose_of(body)[None], controls.trans[None], controls.betas_of(body), 1.0, np.zeros((1, 0))).save(path))
+        controls.pose_of(body)[None], np.zeros((1, 3)), controls.betas_of(body), 1.0, np.zeros((1, 0))).save(path))
 
 
 def _save(controls: Controls, folder: Path, ending: str, write: Callable[[Path, MovableBody], None]) -> list[Path]:

@@ -37,35 +37,29 @@ class MovableStatue(MovableBody):
         super().__init__(model)
         fine = subdivide_uniform(statue.control.mesh, statue.control.chart, LEVEL)
         self.detailed = Reconstruction(statue.control, statue.map, fine)
-        self._corners, self._bary = statue.control.mesh.faces[fine.parent], fine.bary
         self._control = np.zeros((0, 3), dtype=np.float32)
         self.control = MovableBody(model)
-        self.part_of_vertex = self.part_of_vertex[self._corners[np.arange(len(fine.parent)), fine.bary.argmax(axis=1)]]
 
     @property
     def layers(self) -> tuple[MovableBody, ...]:
         """Return the surface, and the control mesh below it."""
         return self, self.control
 
-    def vertices(self, betas: np.ndarray | None, pose: np.ndarray, trans: np.ndarray | None = None) -> np.ndarray:
+    def vertices(self, betas: np.ndarray | None, pose: np.ndarray) -> np.ndarray:
         """Compute the detailed surface (n, 3) float32, metres, relative to the root's joint.
 
         [Statues] Eq. 19, 20
         """
-        self._control = super().vertices(betas, pose, trans)
+        self._control = super().vertices(betas, pose)
         return self.detailed(self._control).astype(np.float32)
 
     def joint(self, part: str, y: np.ndarray) -> np.ndarray:
         """Compute the joint of a part in the control mesh of the latest vertices."""
         return super().joint(part, self._control)
 
-    def mesh(self, betas: np.ndarray | None, pose: np.ndarray, trans: np.ndarray) -> Mesh:
+    def mesh(self, betas: np.ndarray | None, pose: np.ndarray) -> Mesh:
         """Compute the detailed surface with the exact model."""
-        return self.detailed.mesh(self.model.vertices(pose, betas, trans))
-
-    def _below(self, vertex: int) -> tuple[np.ndarray, np.ndarray | None]:
-        """Return the place on the control mesh below a vertex."""
-        return self._corners[[vertex]], self._bary[[vertex]]
+        return self.detailed.mesh(self.model.vertices(pose, betas))
 
 
 def movable(model: BodyModel, statue: Statue | None) -> MovableBody:

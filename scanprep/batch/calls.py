@@ -80,17 +80,6 @@ class KeptCall:
                           for name, value in stored.items()} | {"config": config})
 
 
-def command_of(folder: Path) -> str:
-    """Return the command whose call a folder keeps, such as "scape mosh"; empty text where there is none."""
-    path = _file(folder)
-    try:
-        stored = storage.read_json(path, "a kept call") if path else None
-    except storage.StorageError:
-        return ""
-    kind = stored.get("kind") if isinstance(stored, dict) else None
-    return kind.removeprefix(CALL) if isinstance(kind, str) and kind.startswith(CALL) else ""
-
-
 def _file(folder: Path) -> Path | None:
     """Return the file with the call in a folder, or None."""
     return next((path for path in (folder / RUN, folder / HOME / RUN) if path.is_file()), None)

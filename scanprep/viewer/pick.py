@@ -9,7 +9,6 @@ import threading
 import traceback
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -22,11 +21,10 @@ from ..geometry.sides import other_side
 from ..judgement import extent
 from ..pictures.scene import Pane, pack_scene
 from ..words import explain_os_error, number_of
-from .app import Send
+from .app import Send, Stopped
 from .clicked import Clicked, Places, camera_like, camera_of, predict_landmarks
 from .landmark_names import next_name
 from .messages import Message, call_action, find_action
-from .worker import Stopped
 
 TEMPLATE, SCAN = 0, 1                # numbers of the panes on the page
 
@@ -47,7 +45,6 @@ class PickApp:
     ENOUGH = 4                           # landmarks needed to predict the others: errors were measured with four
 
     name, title = "pick", "Landmarks"
-    folders: Sequence[Path] = ()
 
     def __init__(self, template: Clicked, scans: Sequence[Clicked], names: Sequence[str],
                  fixed: Mapping[str, np.ndarray] | None = None) -> None:
@@ -148,13 +145,6 @@ class PickApp:
             self.depth = self.depth if message.kind == "slide" else None
             call_action(action, message.fields, send)
         send(self.state())
-
-    def receive(self, name: str, path: Path, send: Send) -> None:
-        """Refuse dropped files: there would be no folder to save their landmarks in."""
-        raise ValueError("name scans on the command line: their landmarks are saved beside them")
-
-    def close(self) -> None:
-        """Do nothing: every click was saved."""
 
     def on_place(self, send: Send, pane: int, name: str, origin: list[float], direction: list[float],
                  inside: bool = False, seen: list[float] | None = None, drag: int = 0) -> None:

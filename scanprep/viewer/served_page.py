@@ -60,12 +60,12 @@ def page(title: str, name: str, script: str, style: str, server: str, nonce: str
                        style=re.sub(r"</(?=style)", r"<\\/", style, flags=re.IGNORECASE), script=_inline(script))
 
 
-def policy(host: str, nonce: str) -> str:
+def policy(nonce: str) -> str:
     """Return the Content-Security-Policy of the page: own scripts and workers only, nothing from other machines."""
     return "; ".join((
         "default-src 'none'", f"script-src 'nonce-{nonce}' 'wasm-unsafe-eval'", "worker-src blob:",
         f"style-src-elem 'nonce-{nonce}'", "style-src-attr 'unsafe-inline'", "img-src 'self' data: blob:",
-        f"connect-src 'self' ws://{host} data: blob:", "media-src blob:", "font-src data:",
+        "connect-src 'self' data: blob:", "media-src blob:", "font-src data:",
         "base-uri 'none'", "form-action 'none'", "frame-ancestors 'none'"))
 
 

@@ -1,5 +1,4 @@
 // `scape complete --interactive`: landmarks as in `scape pick`, then a button, the whole body, and what it is worth.
-import { dropZone } from "./drop.js";
 import { make } from "./figure.js";
 import { button, OFF, Pick, WORDS } from "./pick.js";
 
@@ -17,7 +16,6 @@ export class Complete extends Pick {
     this.verdict = make("div", { class: "sk-verdict", hidden: true });
     this.markers = make("p", { class: "sk-file" });
     this.added.placeholder = "a name, or a set: cmu41";
-    this.scans.before(this.dropping = dropZone(this, "drop a scan here, or choose a file"));
     this.list.before(make("div", { class: "sk-buttons" }, this.go, this.anew, this.keep), this.knownLabel, this.verdict, this.markers);
     this.buttons.predict.remove();
   }
@@ -25,7 +23,6 @@ export class Complete extends Pick {
   update(state) {
     super.update(state);
     const { completed, working, can_choose: free, verdicts } = state;      // verdicts: of a folder of completions
-    this.dropping.hidden = Boolean(verdicts);
     this.known.checked = state.known;
     this.knownLabel.hidden = !free;
     const clicked = Object.keys(state.panes[1]?.places ?? {}).length - state.markers;
@@ -59,7 +56,6 @@ export class Complete extends Pick {
   }
 
   hint() {
-    if (this.state.panes.length < 2) return "Drop a scan on the page.";
     if (this.few) return `${super.hint()} ${this.few === 1 ? "One" : "Two"} more, or none, then “complete”.`;
     return this.state.completed ? `${super.hint()} ${WHOLE}` : `${super.hint()} Three to ten landmarks help most; then press “complete”.`;
   }

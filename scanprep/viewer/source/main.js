@@ -1,8 +1,8 @@
 // What a page calls: `scapekit.start()` in reports, `scapekit.start("view")` and the like in programs.
 import { Complete } from "./complete.js";
+import { connect } from "./connection.js";
 import { Figure } from "./figure.js";
 import { Mend } from "./mend.js";
-import { run } from "./pages.js";
 import { Mosh } from "./mosh.js";
 import { hasWebGL } from "./pane.js";
 import { Pick } from "./pick.js";
@@ -40,6 +40,10 @@ async function turn(figure) {
 const PROGRAMS = { complete: Complete, mend: Mend, mosh: Mosh, pick: Pick, view: View };
 
 export function start(name) {
-  if (!name) startReport();
-  else run(PROGRAMS, name);
+  if (!name) {
+    startReport();
+    return;
+  }
+  const connection = connect((message) => window.program.received(message), (state) => window.program.connected(state));
+  window.program = new PROGRAMS[name](connection);
 }

@@ -16,16 +16,16 @@ const KEYS = [["n, p", "next, previous name"], ["z, y", "undo, redo"], ["Delete"
 const MARKS = { set: "sk-on", predicted: "sk-guess", "not set": "sk-off" };
 
 export class Pick extends Program {
-  constructor(connection, page) {
-    super(connection, page);
+  constructor(connection) {
+    super(connection);
     this.linked = false;                                // template and scan stand differently,
     this.alike = 1;                                     // what is made of the scan stands as the scan
-    this.drags = Date.now() % 1e9;                      // of other tabs' numbers too
+    this.drags = Date.now() % 1e9;                      // other numbers than those of the page before
     this.inside = false;
     this.state = null;
     this.on("state", (fields) => this.update(fields));
     this.build();
-    this.onWindow("keydown", (event) => this.key(event));
+    addEventListener("keydown", (event) => this.key(event));
   }
 
   build() {

@@ -6,31 +6,19 @@ import { hasWebGL } from "./pane.js";
 const MOUSE = [["drag, arrow keys", "turn the body"], ["wheel", "zoom"], ["right button", "shift the body"]];
 
 export class Program {
-  constructor(connection, page) {
+  constructor(connection) {
     this.connection = connection;
-    this.page = page;                                   // its number, where there are several, and the one to go back to
-    this.ending = new AbortController();
     document.body.className = "sk-program";
     this.panel = make("aside", { class: "sk-panel" });
     this.stage = make("div", { class: "sk-stage" });
     this.status = make("p", { class: "sk-status", role: "status" });
     this.progress = make("progress", { hidden: true });
-    this.main = make("main", { class: "sk-main" }, this.panel,
-      make("section", { class: "sk-view" }, this.stage, make("footer", {}, this.progress, this.status)));
-    document.body.append(this.main);
+    document.body.append(make("main", { class: "sk-main" }, this.panel,
+      make("section", { class: "sk-view" }, this.stage, make("footer", {}, this.progress, this.status))));
     this.answers = {};
-    for (const kind of ["dragover", "drop"]) this.onWindow(kind, (event) => event.preventDefault());      // else the browser leaves the page
+    for (const kind of ["dragover", "drop"]) addEventListener(kind, (event) => event.preventDefault());      // else the browser leaves the page
     this.theme();
     if (!hasWebGL()) this.say("This browser has no WebGL, so that bodies cannot be shown. Another browser, or its settings, may help.", "bad");
-  }
-
-  // Listen to the whole window until another program takes this one's place.
-  onWindow(kind, answer) { addEventListener(kind, answer, { signal: this.ending.signal }); }
-
-  end() {
-    this.ending.abort();
-    if (this.figure) this.figure.playing = false;
-    this.main.remove();
   }
 
   theme() {
@@ -41,11 +29,7 @@ export class Program {
         document.documentElement.dataset.theme = now === "dark" ? "light" : "dark";
         this.figure?.panes.forEach((pane) => pane.redraw());
       } }, "◐");
-    this.panel.append(make("header", {}, make("h1", {}, this.page.title), button));
-    if (this.page.back) {
-      this.panel.append(make("button", { type: "button", class: "sk-back", title: `back to “${this.page.back}”`,
-        onclick: () => this.send("leave") }, `← ${this.page.back}`));
-    }
+    this.panel.append(make("header", {}, make("h1", {}, document.title), button));
   }
 
   help(keys) {
@@ -55,11 +39,9 @@ export class Program {
 
   on(kind, answer) { this.answers[kind] = answer; }
 
-  // Python drops what is for a page that was left meanwhile.
-  send(kind, fields = {}, latest = "", data = undefined) {
+  send(kind, fields = {}, latest = "") {
     if (this.status.dataset.kind === "bad" && !this.lost) this.say("");         // what was wrong is over
-    const { number } = this.page;
-    this.connection.send(kind, number === undefined ? fields : { ...fields, page: number }, data, latest);
+    this.connection.send(kind, fields, latest);
   }
 
   // Messages one after the other: a scene takes a moment to unpack, and what comes after belongs to it.
@@ -69,7 +51,6 @@ export class Program {
   }
 
   async answer(message) {
-    if (this.ending.signal.aborted) return;
     if (message.kind === "scene") await this.show(message.data, message.fields);
     else if (message.kind === "positions") this.move(message);
     else if (message.kind === "error") this.say(message.fields.text, "bad");
@@ -80,6 +61,7 @@ export class Program {
     document.body.dataset.connection = state;
     if (state === "lost") this.say("The connection is lost; what you do is kept and sent when it is back.", "bad");
     if (state === "refused") this.say("This page was refused: start the program again and use the address that it prints.", "bad");
+    if (state === "elsewhere") this.say("Another page of this program was opened. Load this one again to go on here.", "bad");
     if (state === "open" && this.lost) this.say("");
     this.lost = state !== "open";
   }
@@ -89,7 +71,6 @@ export class Program {
 
   async show(data, fields) {
     const scene = await this.unpack(data, fields);
-    if (this.ending.signal.aborted) return;
     const before = this.figure?.panes.map((pane) => pane.view()), choices = this.figure?.choices();
     this.figure = new Figure(this.stage, scene, this.linked ?? true, this.alike);
     const anew = fields.opened !== this.opened;         // another scan: it opens whole, the template stays as it is

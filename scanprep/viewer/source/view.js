@@ -1,31 +1,25 @@
 // `scape view`: what was named, side by side or laid over each other; models with sliders, motions with their markers.
-import { Plane, Vector3 } from "three";
-import { dropZone } from "./drop.js";
+import { Vector3 } from "three";
 import { choice, make } from "./figure.js";
 import { millimetres } from "./layer.js";
 import { button } from "./pick.js";
 import { Program } from "./program.js";
 
 const FIRST = 10;                    // sliders of the shape that are there before one asks for more
-const STILL = 4;                     // pixels that a hand moves while it clicks
 const NEAR = 12;                     // pixels from a marker that tell of it
 const DEGREE = Math.PI / 180;
-const EMPTY = [["To begin", "drop files anywhere on this page, or choose them with the button “drop files here, or choose”."],
-  ["To look", "meshes (PLY, OBJ, STL, OFF, GLB), point clouds (PLY, XYZ, PCD), models and motions (.npz), markers (C3D, TRC, CSV); landmarks after their mesh."],
-  ["To complete a scan", "drop it: a mesh, a cloud, or a depth picture (16-bit PNG) with its camera (NAME.camera.json). Without a model of your own that of the synthetic people is taken."]];
-const KEYS = [["d", "drag bodies, or turn the view"], ["b, p", "random body, pose"], ["r", "reset"], ["space", "play, pause"],
-  [", and .", "a frame back, forward"], ["arrows", "move the slider that has the focus"]];
+const KEYS = [["r", "reset"], ["space", "play, pause"], [", and .", "a frame back, forward"], ["arrows", "move the slider that has the focus"]];
 
 export class View extends Program {
-  constructor(connection, page) {
-    super(connection, page);
+  constructor(connection) {
+    super(connection);
     document.body.classList.add("sk-looking");
     this.markers = [];
     this.count = FIRST;
     this.on("state", (fields) => this.update(fields));
     this.on("residuals", (fields, data) => this.addMarkers({ ...fields, values: new Float32Array(data.slice().buffer) }));
     this.build();
-    this.onWindow("keydown", (event) => this.key(event));
+    addEventListener("keydown", (event) => this.key(event));
   }
 
   answer(message) {
@@ -39,44 +33,15 @@ export class View extends Program {
     this.more = button("more", "sliders for all components of the shape", () => { this.count += FIRST; this.shapeSliders(); });
     this.part = choice("part", [], (i) => this.send("choose", { part: this.parts[i] }));
     this.angles = ["x", "y", "z"].map((axis, i) => this.slider(`turn about ${axis}`, 180, 1, (value) => this.sendTurn(i, value), "°"));
-    this.dragging = make("input", { type: "checkbox", onchange: () => this.setDragging(this.dragging.checked) });
-    this.pose = make("fieldset", { class: "sk-sliders" }, make("legend", {}, "pose"), this.part, ...this.angles.map((one) => one.row),
-      make("label", {}, this.dragging, "drag a part to pose the body"));
+    this.pose = make("fieldset", { class: "sk-sliders" }, make("legend", {}, "pose"), this.part, ...this.angles.map((one) => one.row));
     this.buttons = make("div", { class: "sk-buttons" },
-      this.randomBody = button("random body", "betas drawn as the training people are spread (b)", () => this.send("random_body")),
-      button("random pose", "a pose drawn from those the model was learned from (p)", () => this.send("random_pose")),
       button("reset", "the mean body at rest (r)", () => this.send("reset")),
       button("save body", "write the mesh, beside what is there", () => this.send("save_body")),
       button("save pose", "write the pose as a motion file of one frame", () => this.send("save_pose")));
     this.notes = make("div", { class: "sk-notes" });
-    this.scan = choice("scan", [], () => {});
-    this.model = choice("model", [], () => {});
-    this.completion = make("fieldset", { class: "sk-sliders", hidden: true }, make("legend", {}, "the whole body from a scan"), this.scan, this.model,
-      button("complete this scan", "click a few landmarks on it and find the whole body", () => this.complete()));
-    this.folders = make("div", { class: "sk-buttons" });
     this.saved = make("p", { class: "sk-file" });
     this.models = make("div", { class: "sk-models", hidden: true }, this.shape, this.pose, this.buttons);
-    this.panel.append(dropZone(this, "drop files here, or choose"), this.list, this.notes, this.completion, this.folders, this.models, this.saved,
-      this.help(KEYS));
-  }
-
-  // What can be opened: a choice is kept for as long as it is there, and a new scan is chosen.
-  offer({ folders, scans, models }) {
-    this.completion.hidden = !scans.length;
-    renew(this.scan, scans.map((i) => [i, this.entries[i].name]));
-    renew(this.model, models.map(({ path, name }) => [path, `with ${name}`]));
-    this.folders.replaceChildren(...folders.map(({ page, folder, label }) =>
-      button(label, folder, () => this.send("enter", { what: page, folder }))));
-  }
-
-  complete() {
-    this.say("opening the scan");
-    this.send("enter", { what: "complete", scan: Number(this.scan.value), model: this.model.value });
-  }
-
-  // What a page says that has nothing to show yet.
-  tellEmpty() {
-    this.stage.replaceChildren(make("div", { class: "sk-empty" }, ...EMPTY.map(([what, how]) => make("p", {}, make("strong", {}, `${what}: `), how))));
+    this.panel.append(this.list, this.notes, this.models, this.saved, this.help(KEYS));
   }
 
   // A labelled slider from minus to plus a limit, with its number.
@@ -102,7 +67,6 @@ export class View extends Program {
     }
     this.shape.hidden = !count;
     this.more.hidden = count === this.betas.length;
-    this.randomBody.hidden = !count;
     this.sliders.forEach((one, i) => one.set(this.betas[i]));
   }
 
@@ -114,19 +78,13 @@ export class View extends Program {
   }
 
   update(state) {
-    const { entries, notes, problems, saved, parts, models } = state;
+    const { entries, notes, problems, saved, parts } = state;
     this.entries = entries;
-    this.list.hidden = !entries.length;
-    if (!entries.length) this.tellEmpty();
-    this.offer(state.pages);
-    this.work(state.working);
-    if (!state.working && (state.note || this.status.dataset.kind !== "bad")) this.say(state.note);
     this.list.replaceChildren(...entries.map((entry, i) => this.entry(entry, i)));
     this.notes.replaceChildren(...problems.map((text) => make("p", { class: "sk-bad" }, text)),
       ...notes.map((text) => make("p", {}, text)));
     this.saved.textContent = saved.length ? `saved: ${saved.join(", ")}` : "";
-    this.shownModels = models;
-    this.models.hidden = !models.length;
+    this.models.hidden = !parts.length;
     if (String(parts) !== String(this.parts)) {
       this.parts = parts;
       this.part.replaceChildren(...parts.map((name) => make("option", {}, name)));
@@ -164,6 +122,7 @@ export class View extends Program {
 
   // Markers are coloured by how far they are from where the body puts them, frame by frame.
   addMarkers(told) {
+    if (told.scene !== this.number) return;
     const dots = this.figure?.panes[told.pane]?.layers[told.layer];
     if (!dots?.motion) return;
     this.markers.push({ ...told, dots });
@@ -208,7 +167,7 @@ export class View extends Program {
     this.timeline(figure);
     figure.panes.forEach((pane, i) => {
       pane.overlays.push((context) => this.drawJoint(context, pane));
-      this.listen(pane, i);
+      pane.canvas.addEventListener("pointermove", (event) => { if (!event.buttons) this.tellMarker(pane, i, event); });
     });
   }
 
@@ -222,44 +181,6 @@ export class View extends Program {
     context.lineWidth = 2.5 * scale;
     context.strokeStyle = "#f0a400";
     context.stroke();
-  }
-
-  setDragging(on) {
-    this.dragging.checked = on;
-    document.body.classList.toggle("sk-dragging", on);
-    this.say(on ? "Drag a part of the body. Beside it the view turns." : "");
-  }
-
-  isBody(number, layer) {
-    return this.shownModels?.some((one) => one.pane === number && one.layer === layer);
-  }
-
-  listen(pane, number) {
-    const { canvas } = pane;
-    let down = null;
-    canvas.addEventListener("pointerdown", (event) => {
-      if (event.button !== 0) return;
-      const hit = pane.hit(event), layer = hit ? pane.layers.indexOf(hit.layer) : -1;
-      down = { x: event.clientX, y: event.clientY, hit: this.isBody(number, layer) ? hit : null, layer, moved: false };
-      if (!down.hit || !this.dragging.checked) return;
-      pane.controls.enabled = false;
-      canvas.setPointerCapture(event.pointerId);
-      down.plane = new Plane().setFromNormalAndCoplanarPoint(pane.camera.getWorldDirection(new Vector3()), hit.point);
-      this.send("grab", { pane: number, layer, vertex: hit.vertex });
-    }, true);
-    canvas.addEventListener("pointermove", (event) => {
-      if (!down) { this.tellMarker(pane, number, event); return; }
-      down.moved ||= Math.hypot(event.clientX - down.x, event.clientY - down.y) > STILL;
-      const at = down.moved && down.plane && pane.ray(event).raycaster.ray.intersectPlane(down.plane, new Vector3());
-      if (at) this.send("drag", { target: at.add(pane.origin).toArray() }, "drag");
-    });
-    const ended = () => {
-      if (down?.hit && !down.moved && !down.plane) this.send("touch", { pane: number, layer: down.layer, vertex: down.hit.vertex });
-      down = null;
-      pane.controls.enabled = true;
-    };
-    canvas.addEventListener("pointerup", ended);
-    canvas.addEventListener("pointercancel", ended);
   }
 
   // How far the marker under the pointer is from where the body puts it, in this frame.
@@ -284,23 +205,12 @@ export class View extends Program {
   key(event) {
     if (event.ctrlKey || event.metaKey || event.altKey || event.target.matches("select, textarea, button, summary")) return;
     const { time } = this.figure ?? {};
-    const actions = { d: () => this.setDragging(!this.dragging.checked), b: () => this.send("random_body"),
-      p: () => this.send("random_pose"), r: () => this.send("reset") };
+    const actions = { r: () => this.send("reset") };
     const moving = { " ": () => this.figure.play(!this.figure.playing), ",": () => this.figure.go(Math.round(this.figure.frame) - 1),
       ".": () => this.figure.go(Math.round(this.figure.frame) + 1) };
-    const action = this.shownModels?.length && actions[event.key] || time && !event.target.matches("[type=checkbox]") && moving[event.key];
+    const action = this.parts?.length && actions[event.key] || time && !event.target.matches("[type=checkbox]") && moving[event.key];
     if (action) { event.preventDefault(); action(); }
   }
-}
-
-// Other options of a list, [value, text]: the last that is new is chosen, else what was.
-function renew(select, options) {
-  const before = [...select.options].map((option) => [option.value, option.text]);
-  if (String(before) === String(options)) return;
-  const known = before.map(([, text]) => text), chosen = known[select.selectedIndex];
-  const fresh = options.findLastIndex(([, text]) => !known.includes(text));
-  select.replaceChildren(...options.map(([value, text]) => make("option", { value }, text)));
-  select.selectedIndex = fresh >= 0 ? fresh : Math.max(0, options.findIndex(([, text]) => text === chosen));
 }
 
 function middle({ positions, count, hidden }) {
