@@ -5,7 +5,6 @@ import numpy as np
 from socket_client import Page
 
 from completion.viewing.app import MOVES
-from scanprep.viewer.messages import Message
 from scanprep.viewer.server import Server
 
 NEST = [[]]

@@ -40,8 +40,7 @@ def case(model, tmp_path):
     write_points(tmp_path / "half.ply", PointCloud(points))
     work = CompletionTask(model, "worm", dict(zip(NAMES, map(int, MARKS), strict=True)), QUICK)
     app = CompleteApp(model, work, [tmp_path / "half.ply"], tmp_path / "out")
-    yield body, points, seen, app
-    app.close()
+    return body, points, seen, app
 
 
 def sent(app, kind, **fields):
@@ -148,35 +147,6 @@ def test_too_few_landmarks_and_nothing_to_save_are_refused(case):
     marked(app, body, seen, 2)
     with pytest.raises(ValueError, match="at least 3 landmarks"):
         sent(app, "complete")
-
-
-def test_a_dropped_scan_is_completed_beside_the_others(case, tmp_path):
-    _, points, _, app = case
-    write_points(tmp_path / "drop.ply", PointCloud(points + 1.0))
-    opened = app.greet()[0].fields["opened"]
-    app.receive("drop.ply", tmp_path / "drop.ply", lambda message: None)
-    assert app.scan.path.name == "drop.ply" and len(app.scans) == 2
-    assert app.greet()[0].fields["opened"] == opened + 1                   # so that the page shows the whole of it
-    assert app.scan.file.parent == app.output and app.scan.path.parent != tmp_path
-    (tmp_path / "broken.ply").write_bytes(b"ply\nnothing")
-    with pytest.raises(ValueError, match=r"broken\.ply"):
-        app.receive("broken.ply", tmp_path / "broken.ply", lambda message: None)
-    assert len(app.scans) == 2
-
-
-def test_a_scan_dropped_again_takes_its_place_and_keeps_its_landmarks(case, tmp_path):
-    body, points, seen, app = case
-    write_points(tmp_path / "drop.ply", PointCloud(points))
-    for _ in range(2):
-        app.receive("drop.ply", tmp_path / "drop.ply", lambda message: None)
-        marked(app, body, seen, 3)
-        app.scan.save()
-        assert len(app.scans) == 2 and app.current == 1
-    assert len(read_landmarks(app.output / "drop.landmarks.json")) == 3 == len(app.scan.places)
-    again = CompleteApp(app.model, app.work, [], app.output)                # another session
-    again.receive("drop.ply", tmp_path / "drop.ply", lambda message: None)
-    assert set(again.scan.places) == set(app.scan.places)
-    again.close()
 
 
 @pytest.mark.slow

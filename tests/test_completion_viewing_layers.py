@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from browser import wait_until
 from conformance_bodies import KINDS
+from viewing_apps import ask, seen
 
 from completion.mocap.files.markers import MarkerSequence
 from completion.mocap.soft_tissue.soft_tissue import SoftTissue
@@ -23,7 +24,6 @@ from model.statue.detail.reconstruction import Reconstruction
 from model.statue.detail.subdivision import subdivide_uniform
 from model.statue.files import save_statue, write_body
 from scanprep import read_mesh
-from scanprep.viewer.messages import Message
 from scanprep.viewer.server import Server
 
 OWN = np.array([0.6, -0.4, 0.3])
@@ -72,7 +72,7 @@ def detailed(place, app):
     """The exact surface where the sliders stand, and the control mesh below it."""
     body, control = load_model(place.folder / "statue" / "body.npz"), place.statue.control
     pose = np.array([app.controls.turns[name] for name in app.controls.shown[0].body.parts])
-    moved = body.vertices(pose, None, app.controls.trans)
+    moved = body.vertices(pose)
     return Reconstruction(control, place.statue.map, subdivide_uniform(control.mesh, control.chart, 2))(moved), moved
 
 
@@ -80,10 +80,6 @@ def told(app, layer):
     """The vertices of a layer that the app sent last, metres in the world."""
     message = next(m for m in app.greet() if m.kind == "positions" and m.fields["layer"] == layer)
     return np.frombuffer(message.data, "<f4").reshape(-1, 3) + app.cameras[0].target
-
-
-def ask(app, kind, **fields):
-    app.handle(Message(kind, fields), lambda message: None)
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -153,19 +149,6 @@ def test_sliders_pose_a_statue_and_the_detail_stands_on_it(place, tmp_path):
         place.folder / "statue" / "body.npz").subject(None))[0], control, atol=1e-6)
 
 
-def test_a_statue_is_dragged_by_its_surface(place):
-    app = ViewApp(Files((place.folder / "statue",)).entries())
-    body = app.controls.shown[0].body
-    hand = body.parts.index("left wrist")
-    vertex = int(np.flatnonzero(body.part_of_vertex == hand)[40])
-    before = told(app, 0)[vertex].astype(float)
-    ask(app, "grab", pane=0, layer=0, vertex=vertex)
-    wanted = before + [0, 0.05, 0.08]
-    for share in (0.5, 1.0, 1.0, 1.0):
-        ask(app, "drag", target=(before + share * (wanted - before)).tolist())
-    assert np.linalg.norm(told(app, 0)[vertex] - wanted) < 0.03 < np.linalg.norm(before - wanted)
-
-
 @pytest.mark.slow
 def test_a_page_shows_both(place, new_page):
     app = ViewApp(Files((place.folder / "statue", place.folder / "walk"), place.folder / "worm.npz").entries())
@@ -186,13 +169,6 @@ def test_a_page_shows_both(place, new_page):
         assert page.evaluate("program.figure.panes[1].layers.map((layer) => layer.object.visible)") == [True, False]
         assert np.abs(seen(page, 1, 0) - rigid).max() < 2e-3
     assert not [error for error in page.errors if "ERR_CONNECTION" not in error]
-
-
-def seen(page, pane, layer):
-    """The vertices (N, 3) of a layer in the page, metres in the world."""
-    values, origin = page.evaluate(f"(() => {{ const p = program.figure.panes[{pane}];"
-                                   f"return [Array.from(p.layers[{layer}].positions), p.origin.toArray()]; }})()")
-    return np.array(values).reshape(-1, 3) + origin
 
 
 def test_a_notebook_shows_statues_and_soft_tissue(place, tmp_path):

@@ -71,12 +71,11 @@ def test_processes_change_nothing(six, template, tmp_path):
 @pytest.mark.parametrize("processes, seen", [(True, True), (False, False)])
 def test_a_cluster_changes_nothing(six, template, tmp_path, processes, seen, monkeypatch):
     """Nor one whose workers do not see the files, which then travel along."""
-    from distributed import Client, LocalCluster
-
+    distributed = pytest.importorskip("distributed", reason='Dask is not installed: pip install "scapekit[cluster]"')
     scans, whole = six
     layout = {"n_workers": 2, "threads_per_worker": 1} if processes else {"n_workers": 1, "threads_per_worker": 3}
-    with LocalCluster(processes=processes, dashboard_address=None, **layout) as local:
-        with Client(local, set_as_default=False) as client:
+    with distributed.LocalCluster(processes=processes, dashboard_address=None, **layout) as local:
+        with distributed.Client(local, set_as_default=False) as client:
             here = [task.scan for task in find_scans(scans)]
             assert cluster._has_same_files(client, here) and cluster._has_same_files(client, [tmp_path / "none"])
             monkeypatch.setattr(Path, "absolute", lambda path: Path("/elsewhere") / path.name)
@@ -121,9 +120,17 @@ def test_what_a_worker_noticed_is_told_here_with_our_paths(tmp_path):
 
 
 def test_no_scheduler(scans, template, tmp_path, monkeypatch):
+    pytest.importorskip("distributed", reason='Dask is not installed: pip install "scapekit[cluster]"')
     monkeypatch.setattr(cluster, "ANSWER", 1)
     config = dataclasses.replace(QUICK, workers=Workers("tcp://127.0.0.1:1"))
     with pytest.raises(ValueError, match=r"none answers at tcp://127\.0\.0\.1:1"):
+        prepare(find_scans(scans), template, MARKS, tmp_path / "set", config)
+
+
+def test_a_scheduler_without_dask_is_told_in_a_line(scans, template, tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "distributed", None)
+    config = dataclasses.replace(QUICK, workers=Workers("tcp://127.0.0.1:1"))
+    with pytest.raises(ValueError, match=r'which needs: pip install "scapekit\[cluster\]"'):
         prepare(find_scans(scans), template, MARKS, tmp_path / "set", config)
 
 

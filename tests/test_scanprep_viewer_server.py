@@ -45,7 +45,7 @@ def test_the_token_gives_the_page_and_a_cookie(server):
     nonce = headers["Content-Security-Policy"].partition("'nonce-")[2].partition("'")[0]
     assert len(nonce) > 10 and f'<script nonce="{nonce}">scapekit.start("pick")</script>'.encode() in body
     assert server.gate.token.encode() not in body
-    assert ask(server, token=False, Cookie=cookie.partition(";")[0])[0] == 200
+    assert ask(server, token=False, Cookie=f'other={{"a": [1]}}; {cookie.partition(";")[0]}')[0] == 200
 
 
 def test_the_address_for_a_browser_opens_once(server):
@@ -73,14 +73,14 @@ def test_a_foreign_origin_neither_acts_nor_listens(server, app, path, headers):
     headers = {name: value.format(port=server.port) for name, value in headers.items()}
     page = Page(server)
     page.next()
-    status, _, body = ask(server, f"{path}?page={page.name}&turn=0", "POST", Message("click", {"n": 1}, number=1).pack(),
-                          **headers)
+    click = Message("click", {"n": 1}, number=1).pack()
+    status, _, body = ask(server, f"{path}?page={page.name}&turn=0", "POST", click, **headers)
     assert refused_in_one_line(server, 403, status) and b"click" not in body and not app.seen
 
 
 @pytest.mark.parametrize(("method", "path", "status"), [
-    ("GET", "/message", 404), ("POST", "/", 404), ("POST", "/file/body.ply", 404), ("PUT", "/", 501), ("TRACE", "/", 501),
-    ("GET", "/" + 70_000 * "a", 414)])
+    ("GET", "/message", 404), ("POST", "/", 404), ("POST", "/file/body.ply", 404), ("PUT", "/", 501),
+    ("TRACE", "/", 501), ("GET", "/" + 70_000 * "a", 414)])
 def test_there_are_no_other_addresses(server, method, path, status):
     assert refused_in_one_line(server, status, ask(server, path, method, b"" if method == "POST" else None,
                                                    Origin=f"http://127.0.0.1:{server.port}")[0])

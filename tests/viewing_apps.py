@@ -59,13 +59,6 @@ def seen(page, pane=0, layer=0):
     return np.array(values).reshape(-1, 3) + origin
 
 
-def on_screen(page, point):
-    """Where a point (3,), metres in the world, is in the window, pixels."""
-    return page.evaluate(f"""(() => {{ const pane = program.figure.panes[0], box = pane.canvas.getBoundingClientRect();
-        const q = pane.project(pane.camera.position.clone().fromArray({point.tolist()}).sub(pane.origin));
-        return [box.left + q.x, box.top + q.y]; }})()""")
-
-
 def open_app(page, server):
     page.goto(server.opening())
     wait_until(page, "Boolean(window.program?.figure && program.entries)", 20)
@@ -73,4 +66,4 @@ def open_app(page, server):
 
 def expected(app, model):
     turns, betas = app.controls.turns, app.controls.betas[:model.n_betas]
-    return model.vertices(np.array([turns[name] for name in model.skeleton.names]), betas, app.controls.trans)
+    return model.vertices(np.array([turns[name] for name in model.skeleton.names]), betas)

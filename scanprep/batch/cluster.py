@@ -29,10 +29,13 @@ def run_on_cluster(address: str, work: Any, jobs: Sequence[Job]) -> Iterator[tup
     Raises
     ------
     ValueError
-        No scheduler answers at the address, it has no workers, or they run other versions.
+        No scheduler answers at the address, it has no workers, they run other versions, or Dask is not installed.
     """
-    from distributed import Client, as_completed
-
+    try:
+        from distributed import Client, as_completed
+    except ImportError:
+        raise ValueError(f'workers: {address} is a Dask cluster, which needs: pip install "scapekit[cluster]"'
+                         ) from None
     try:
         client = Client(address, timeout=ANSWER, set_as_default=False)
     except (OSError, ValueError) as error:
@@ -98,8 +101,6 @@ def _entrance() -> Callable[[bytes, bytes], tuple[Any, dict[str, bytes], list[st
 
 def _outcome(future: Any, job: Job, address: str) -> Any:
     """Return the result of a finished job, or a Failure, and write its files into the job's folder."""
-    from distributed import KilledWorker
-
     try:
         error = future.exception()
     except CancelledError:
@@ -114,6 +115,8 @@ def _outcome(future: Any, job: Job, address: str) -> Any:
             path.parent.mkdir(parents=True, exist_ok=True)
             storage.create_file(path, data)
         return value
+    from distributed import KilledWorker
+
     if isinstance(error, KilledWorker):
         return Failure(f"{job.name}: the workers at work on it died, one after another")
     raise ValueError(f"workers: a worker of {address} cannot run this ({type(error).__name__}: "

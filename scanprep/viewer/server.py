@@ -13,11 +13,10 @@ import time
 import traceback
 import webbrowser
 from collections.abc import Callable
-from http.cookies import CookieError, SimpleCookie
 from http.server import BaseHTTPRequestHandler
 from pathlib import Path
 from typing import Any
-from urllib.parse import parse_qs, urlsplit
+from urllib.parse import parse_qs
 
 from .. import console
 from ..interrupts import terminate_as_interrupt
@@ -139,6 +138,8 @@ class Server:
         with self._news:
             self._news.wait_for(lambda: self._frames or self._stopped or (page, turn) != (self._page, self._turn),
                                 QUIET)
+            if self._stopped:
+                raise Stopped
             if (page, turn) != (self._page, self._turn):
                 return None
             key = next(iter(self._frames), None)
@@ -147,14 +148,14 @@ class Server:
     def take_in(self, page: str, message: Message) -> bool:
         """Act on a message of the page, once even if it arrives again; False where another page took its place."""
         with self._working:
+            if self._stopped:
+                raise Stopped
             if page != self._page:
                 return False
-            if message.number > self._last and not self._stopped:
+            if message.number > self._last:
                 self._last = message.number
                 try:
                     self.app.handle(message, self.send)
-                except Stopped:
-                    pass
                 except (Exception, SystemExit) as problem:
                     self._report_failure(problem)
             return True
@@ -184,6 +185,7 @@ class Door(socketserver.ThreadingTCPServer):
     """The listening socket; of too many connections without token it closes the oldest."""
 
     daemon_threads = True
+    request_queue_size = 128                             # connections that wait while others are accepted
     allow_reuse_address = sys.platform != "win32"        # there it would let another program take the port
 
     def __init__(self, address: tuple[str, int], app_server: Server) -> None:
@@ -231,16 +233,18 @@ class Request(BaseHTTPRequestHandler):
 
     def _answer(self, routes: dict[str, Callable[[], None]], acts: bool) -> None:
         """Check a request, and answer it or refuse it."""
-        app_server, address = self.server.app_server, urlsplit(self.path)
-        self.query = {name: values[-1] for name, values in parse_qs(address.query).items()}
+        path, _, query = self.path.partition("?")
+        self.query = {name: values[-1] for name, values in parse_qs(query).items()}
         try:
-            self._check(app_server.gate, address.path, acts)
+            self._check(self.server.app_server.gate, path, acts)
             self.server.strangers.pop(self.connection, None)
-            if address.path not in routes:
+            if path not in routes:
                 raise RefusedError(404, "no such address")
-            routes[address.path]()
+            routes[path]()
         except RefusedError as refusal:
             self.send_error(refusal.status, str(refusal))
+        except Stopped:
+            self.close_connection = True                 # without an answer, as a server that is gone
 
     def _check(self, gate: Gate, path: str, acts: bool) -> None:
         """Refuse wrong hosts and tokens, and wrong origins where the request changes something."""
@@ -249,12 +253,10 @@ class Request(BaseHTTPRequestHandler):
             raise RefusedError(403, f"foreign Host {host}")
         if acts and gate.wrong_origin(host, origin):
             raise RefusedError(403, f"foreign Origin {origin or '(none)'}")
-        try:
-            cookie = SimpleCookie(self.headers.get("Cookie", "")).get(gate.cookie)
-        except CookieError:
-            cookie = None
+        # plainly taken apart: cookies of other programs on this machine may be of any form
+        cookies = dict(part.strip().partition("=")[::2] for part in self.headers.get("Cookie", "").split(";"))
         opened = path == "/" and "open" in self.query and gate.use(self.query["open"])
-        if not opened and gate.wrong_token(self.query.get("token"), None if cookie is None else cookie.value):
+        if not opened and gate.wrong_token(self.query.get("token"), cookies.get(gate.cookie)):
             raise RefusedError(403, "wrong or missing token")
         if self.query.get("server", gate.server) != gate.server:
             raise RefusedError(403, "a page of an earlier server")
@@ -308,7 +310,7 @@ class Request(BaseHTTPRequestHandler):
 
     def send_error(self, code: int, message: str | None = None, explain: str | None = None) -> None:
         """Refuse a request, and report it in the terminal without the token."""
-        path = urlsplit(getattr(self, "path", "")).path
+        path = getattr(self, "path", "").partition("?")[0]
         why = message or self.responses.get(code, ("",))[0]
         self.server.app_server.say(one_line(f"refused: {self.command or '?'} {path}: {why}"))
         text = "Refused: open the address that the terminal shows." if code == 403 else self.responses[code][0]

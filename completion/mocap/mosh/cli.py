@@ -124,7 +124,7 @@ def carry_out(call: MoshCall, space: Workspace, workers: Workers, command: str, 
     return replace(outcome, judgement=judged[0] if judged and len(actors) == 1 else outcome.judgement,
                    following=f"open {quote(str(space.folder / 'report.html'))}; "
                    f"then scape view {quote(str(space.folder))}, "
-                   "with --mend to correct markers")
+                   f"or scape view --mend {quote(str(space.folder))} to correct markers")
 
 
 def describe(call: MoshCall, model: str, actors: Sequence[Actor]) -> FolderCommand:
@@ -139,7 +139,7 @@ def describe(call: MoshCall, model: str, actors: Sequence[Actor]) -> FolderComma
         ("person", "people"), "{} from markers", _summary, lambda rows: figure(rows, FIXED),
         {"mosh": call.config, "model": model, "layout": call.layout, "held out": call.hold_out}, lines,
         "A marker that sits elsewhere than the layout has it, labels that are exchanged, a marker that should not be "
-        "used: `scape view FOLDER --mend` puts them right and runs again.", call)
+        "used: `scape view --mend FOLDER` puts them right and runs again.", call)
 
 
 def _summary(results: Results, count: int) -> list[Metric]:
