@@ -85,8 +85,8 @@ def frames_to_play(motion: Motion) -> tuple[np.ndarray, float]:
 
 
 def moving_pane(motion: Motion, subject: Subject, dots: Sequence[tuple[Dots, np.ndarray]] = (),
-                bodies: Bodies | None = None, light: LightMesh | None = None, label: str = "",
-                color: Sequence[float] | None = None) -> Pane:
+                bodies: Bodies | None = None, light: LightMesh | None = None, color: Sequence[float] | None = None
+                ) -> Pane:
     """Make a pane of a body in motion, with dots; the body stays in the middle of the picture.
 
     Parameters
@@ -101,8 +101,6 @@ def moving_pane(motion: Motion, subject: Subject, dots: Sequence[tuple[Dots, np.
         Returns vertices (n, N, 3), metres, of frames (n,), if not those of the subject.
     light : LightMesh, optional
         The simplified mesh, if it is known already.
-    label : str
-        Title of the pane.
     color : (3,) float, optional
         Colour of the body.
 
@@ -129,7 +127,7 @@ def moving_pane(motion: Motion, subject: Subject, dots: Sequence[tuple[Dots, np.
             shapes.append(Moving(Solid(first, look, name=name), seen, rate))
     shapes += [Moving(replace(one, points=(place - middle)[0]), place - middle, rate) for one, place in dots]
     camera = facing(subject, motion.poses, shown[:: max(1, len(shown) // 50)].reshape(-1, 3))
-    return Pane(shapes, camera, label)
+    return Pane(shapes, camera)
 
 
 def pane_with_dots(motion: Motion, subject: Subject, places: np.ndarray, name: str, labels: Sequence[str],
@@ -156,7 +154,7 @@ def seconds(motion: Motion, frames: np.ndarray) -> list[str]:
 
 
 def bodies_in_a_row(subject: Subject, poses: np.ndarray, bodies: np.ndarray, colors: np.ndarray | None = None,
-                    height: int = 360, turn: float = TURN) -> list[np.ndarray]:
+                    height: int = 360) -> list[np.ndarray]:
     """Render bodies (n, N, 3) in poses (n, J, 3) at one scale; `colors` (n, N, 3) are of their vertices."""
     size, images = 1.06 * np.ptp(bodies, axis=1).max(axis=0) / 2, []
     vertical = stance(subject.template, rotations.exp(poses[:, 0]))[0]
@@ -165,16 +163,15 @@ def bodies_in_a_row(subject: Subject, poses: np.ndarray, bodies: np.ndarray, col
     for i, body in enumerate(bodies):
         middle = (body.min(axis=0) + body.max(axis=0)) / 2
         middle[up] = floor + sign * size[up] / 1.06                        # all stand on one line
-        camera = facing(subject, poses[i], np.stack([middle - size, middle + size]), turn, vertical)
+        camera = facing(subject, poses[i], np.stack([middle - size, middle + size]), vertical=vertical)
         images.append(render(Solid(subject.template.with_vertices(body), None if colors is None else colors[i]), camera,
                              int(0.62 * height), height))
     return images
 
 
-def picture_bodies(motion: Motion, subject: Subject, bodies: np.ndarray, frames: np.ndarray, count: int = 8
-                   ) -> np.ndarray:
+def picture_bodies(motion: Motion, subject: Subject, bodies: np.ndarray, frames: np.ndarray) -> np.ndarray:
     """Render some meshes (n, N, 3) of a changing body side by side, at one scale; `frames` (n,) is when."""
-    chosen = spread_indices(len(frames), count)
+    chosen = spread_indices(len(frames), 8)              # so many fit side by side
     return contact_sheet(bodies_in_a_row(subject, motion.poses[frames[chosen]], bodies[chosen]),
                          seconds(motion, frames[chosen]))
 

@@ -5,6 +5,10 @@ import time
 
 import pytest
 
+from scanprep.viewer.server import Server
+
+# all panes of a program are drawn
+DRAWN = "Boolean(window.program?.figure && program.state) && program.figure.panes.every((pane) => pane.drawn > 1)"
 NAMES = ("chromium", "chromium-browser", "google-chrome")
 FLAGS = ("--headless", "--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader",
          "--disable-quic", "--no-first-run", "--disable-background-networking", "--disable-component-update",
@@ -53,6 +57,17 @@ def new_page(browser):
 def page(new_page):
     """One such page, online."""
     return new_page()
+
+
+@contextlib.contextmanager
+def opened(new_page, app, ready=DRAWN, width=1200, height=800, **options):
+    """The page of an app, when it is ready; nothing went wrong in it."""
+    with Server(app, say=lambda line: None) as server:
+        page = new_page(viewport={"width": width, "height": height}, **options)
+        page.goto(server.opening())
+        wait_until(page, ready, 20)
+        yield page
+        assert not [error for error in page.errors if "ERR_CONNECTION" not in error]
 
 
 def watched(context):

@@ -103,26 +103,6 @@ def test_digests_change_with_everything(tmp_path):
     assert digests.of(file) not in found
 
 
-def test_a_file_is_read_once_until_it_changes(tmp_path, monkeypatch):
-    file = tmp_path / "f"
-    file.write_bytes(b"one")
-    first = Digests(tmp_path / "known.json")
-    one = first.of_file(file)
-    first.save()
-    assert not (tmp_path / "known.json").exists()                # it had just been written: clocks are coarse
-    monkeypatch.setattr(digests_module, "SETTLED", -10**12)
-    first.of_file(file)
-    first.save()
-    again = Digests(tmp_path / "known.json")
-    stat = os.stat(file)
-    monkeypatch.setattr("builtins.open", None)                   # it is not read
-    assert again.of_file(file) == one
-    monkeypatch.undo()
-    file.write_bytes(b"two")                                     # of the same size
-    os.utime(file, ns=(stat.st_atime_ns, stat.st_mtime_ns))      # and, as they say, of the same time
-    assert again.of_file(file) != one
-
-
 def test_only_what_depends_on_a_change_is_done_anew(tmp_path, texts):
     done, made = copied(tmp_path, texts)
     assert made == 3 and done.values == {"a": 9, "b": 9, "c": 9} and done.fresh == ("a", "b", "c")

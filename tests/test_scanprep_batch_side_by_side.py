@@ -4,7 +4,6 @@ import os
 import numpy as np
 import pytest
 
-from scanprep import threads
 from scanprep.batch import pool
 from scanprep.batch.pool import SideBySide
 
@@ -41,15 +40,3 @@ def test_side_by_side_where_processes_die_or_fail(two_helpers):
         assert made[0] == made[3] == made[4] == here             # from then on in this process
         with pytest.raises(ValueError, match="five"):
             found(5)
-
-
-def test_no_processes_for_little_work_one_core_or_inside_a_worker(monkeypatch):
-    with SideBySide(lambda item: os.getpid(), list(range(50))) as found:
-        assert {found(number) for number in range(50)} == {os.getpid()}
-    monkeypatch.setattr(threads, "_cores", lambda: 8)
-    assert threads.helpers(4) == 4
-    monkeypatch.setattr(threads, "_cores", lambda: 1)
-    assert threads.helpers(4) == 0
-    monkeypatch.setattr(threads, "_cores", lambda: 8)
-    monkeypatch.setattr(threads, "_in_worker", True)
-    assert threads.helpers(4) == 0

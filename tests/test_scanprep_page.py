@@ -1,6 +1,5 @@
 """The page of a set: worst first, every scan on it, nothing that must be fetched; and the figures behind it."""
 import re
-import shutil
 from dataclasses import replace
 
 import numpy as np
@@ -98,14 +97,6 @@ def test_a_long_page_leaves_pictures_in_the_folder(folder, monkeypatch):
     linked = re.findall(r'<img src="(pictures/[^"]+)"[^>]* loading="lazy"', page)
     assert len(linked) == 3 and "pictures/body3.webp" not in linked and "data:image/webp" in page
     assert all((folder / path).is_file() for path in linked)
-
-
-def test_a_set_of_an_earlier_version_has_no_scenes(folder, tmp_path):
-    shutil.copytree(folder, tmp_path / "set")
-    for path in (tmp_path / "set" / "pictures").glob("*.scene"):
-        path.unlink()
-    page = pictures.write_set_page(tmp_path / "set").read_text()
-    assert not scenes_of(page) and page.count('loading="lazy"') == 4
 
 
 def test_pictures_show_what_they_say(folder):

@@ -73,11 +73,6 @@ def test_text_is_escaped():
     assert not Reader(page.html()).all("script")
 
 
-def test_pictures_are_checked(image):
-    with pytest.raises(ValueError, match="image: expected an array"):
-        Page("x").picture(b"nothing known")
-
-
 def test_missing_numbers_show_as_a_dash():
     assert "<td class=\"number\">–</td>" in Page("x").table([(float("nan"),)]).html()
 

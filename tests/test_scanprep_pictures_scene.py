@@ -10,7 +10,7 @@ from scanprep.pictures import scene as scenes
 from scanprep.pictures.camera import Camera, look_around, stance
 from scanprep.pictures.low_rank import TOLERANCE, low_rank
 from scanprep.pictures.page import Page
-from scanprep.pictures.scene import Pane, match_camera_scales, pack_scene, picture_panes, small_scene, worst_that_turn
+from scanprep.pictures.scene import Pane, match_camera_scales, pack_scene, picture_panes, small_scene
 from scanprep.pictures.shading import Bones, Dots, Heat, Moving, Solid, sphere
 from scanprep.pictures.thinning import MOST, thin_solid
 
@@ -191,12 +191,6 @@ def test_large_meshes_are_thinned_and_keep_their_colours():
     assert len(read.faces(read.layers[0])) <= scenes.SMALL < len(mesh.faces)
 
 
-def test_no_shape_has_more_triangles_than_can_be_shown():
-    mesh = Mesh(*sphere(6))
-    read = SceneReader(pack_scene([pane(Solid(mesh))]))
-    assert len(read.faces(read.layers[0])) <= MOST < len(mesh.faces)
-
-
 def test_panes_beside_each_other_are_of_one_scale(body):
     small = body.with_vertices(body.vertices.mean(axis=0) + 0.5 * (body.vertices - body.vertices.mean(axis=0)))
     cameras = [p.camera for p in match_camera_scales([Pane([m], Camera.around(m)) for m in (body, small)])]
@@ -216,14 +210,6 @@ def test_a_page_carries_the_viewer_once_and_its_scenes(body):
     assert [scene.layers[0]["name"] for scene in scenes_of(page)] == ["one", "two"]
     assert page.count('id="viewer"') == 1 and page.count("data:image/webp") == 2
     assert "viewer" not in Page("x").text("no bodies").html()
-
-
-def test_the_worst_turn_as_long_as_there_is_room(tmp_path, monkeypatch):
-    monkeypatch.setattr(scenes, "MOST_BYTES", 25)
-    paths = [tmp_path / f"{i}.scene" for i in range(5)]
-    for path in paths[1:]:
-        path.write_bytes(b"0123456789")
-    assert [one is not None for one in worst_that_turn(paths)] == [False, True, True, False, False]
 
 
 @pytest.mark.filterwarnings("error")

@@ -1,6 +1,5 @@
 """Apps of `scape view` over small files, and what their page shows."""
 import numpy as np
-from browser import wait_until
 from model_bodies import worm_model
 
 from completion.motion import Motion
@@ -10,6 +9,7 @@ from scanprep import write_landmarks, write_mesh
 from scanprep.geometry.files import PointCloud, write_points
 from scanprep.viewer.messages import Message
 
+OPEN = "Boolean(window.program?.figure && program.entries)"
 PART = "part3"                       # the last of the worm's chain of two
 
 
@@ -57,11 +57,6 @@ def seen(page, pane=0, layer=0):
     values, origin = page.evaluate(f"(() => {{ const p = program.figure.panes[{pane}];"
                                    f"return [Array.from(p.layers[{layer}].positions), p.origin.toArray()]; }})()")
     return np.array(values).reshape(-1, 3) + origin
-
-
-def open_app(page, server):
-    page.goto(server.opening())
-    wait_until(page, "Boolean(window.program?.figure && program.entries)", 20)
 
 
 def expected(app, model):

@@ -18,8 +18,7 @@ def skin_material(color: Sequence[float] = (0.60, 0.57, 0.53)) -> dict[str, Any]
         "baseColorFactor": [*color, 1], "metallicFactor": 0, "roughnessFactor": 0.75}}
 
 
-def write_animated_glb(path: str | Path, faces: np.ndarray, frames: np.ndarray, rate: float,
-                       colors: np.ndarray | None = None, up: int = 2) -> None:
+def write_animated_glb(path: str | Path, faces: np.ndarray, frames: np.ndarray, rate: float, up: int = 2) -> None:
     """Write a moving mesh without a skeleton as GLB that any glTF 2.0 viewer plays.
 
     Every frame is a morph target with its own normals; the animation blends from one to the next. Only the core of glTF
@@ -35,28 +34,23 @@ def write_animated_glb(path: str | Path, faces: np.ndarray, frames: np.ndarray, 
         Vertices of every frame.
     rate : float, frames per second
         How fast it is played.
-    colors : (N, 3) float in [0, 1], optional
-        Colours of the vertices.
     up : int
         Axis that points up, which is turned to y.
     """
-    write_file(path, encode_animated_glb(faces, frames, rate, colors, up))
+    write_file(path, encode_animated_glb(faces, frames, rate, up))
 
 
-def encode_animated_glb(faces: np.ndarray, frames: np.ndarray, rate: float, colors: np.ndarray | None = None,
-                        up: int = 2
-                        ) -> bytes:
+def encode_animated_glb(faces: np.ndarray, frames: np.ndarray, rate: float, up: int = 2) -> bytes:
     """Return the bytes that `write_animated_glb` writes."""
     frames, faces = np.asarray(frames, dtype=float), np.asarray(faces)
     _check(frames, rate)
     turn = turn_up(up).T
     glb, count = Glb(), len(frames) - 1
     # the first frame is the mesh, every other one a morph target
-    first = Mesh(frames[0] @ turn, faces, colors)
+    first = Mesh(frames[0] @ turn, faces)
     mesh: dict[str, Any] = {"name": "body", "primitives": [
         glb.add_surface(first, targets=[frame @ turn - first.vertices for frame in frames[1:]])]}
-    material = skin_material((1, 1, 1)) if colors is not None else skin_material()
-    document = one_mesh(mesh, material, {"name": "body"})
+    document = one_mesh(mesh, skin_material(), {"name": "body"})
     if count:
         # the animation: at frame t the weight of target t is 1, all others are 0
         mesh["weights"] = [0] * count

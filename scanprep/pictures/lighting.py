@@ -5,7 +5,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.ndimage import gaussian_filter, map_coordinates
 
 from ..geometry.format_common import as_seen
 from ..geometry.sparse import unique_integers
@@ -63,9 +62,6 @@ class Scene:
         self._kept = TriangleMesh(self._tree, *_merge_shapes(shapes))
         span = self.corners.reshape(-1, 3)
         self.size = float(np.linalg.norm(np.ptp(span, axis=0))) if len(span) else 1.0
-        # the floor is at the lowest point of the solid shapes
-        solids = [s.corners.reshape(-1, 3) @ vertical for s in shapes if s.faces is not None and len(s.corners)]
-        self.floor = min((float(h.min()) for h in solids), default=np.inf)
 
     def cast(self, origins: np.ndarray, directions: np.ndarray) -> Seen:
         """Cast rays, and shade what they hit."""
@@ -135,39 +131,6 @@ class Scene:
         sheen = 0.07 * gloss * key_light + 0.10 * (1 - facing) ** 4 * ambient
         return color * diffuse + np.where(inner[:, None], 0, sheen), facing[:, 0]
 
-    def ground_shadow(self, origins: np.ndarray, directions: np.ndarray, cells: int = 64) -> np.ndarray:
-        """Compute the opacity of the shadow on the floor along each ray."""
-        # a grid on the floor, wider than the body by a third of its height
-        across = np.stack([self.axes[0], np.cross(self.vertical, self.axes[0])], axis=1)
-        points = self.corners.reshape(-1, 3)
-        tall = 0.30 * float(np.ptp(points @ self.vertical))
-        low, high = (points @ across).min(axis=0) - tall, (points @ across).max(axis=0) + tall
-        s, t = np.meshgrid(*(np.linspace(low[i], high[i], cells) for i in range(2)), indexing="ij")
-        dark = self._floor_darkness(np.stack([s.ravel(), t.ravel()], axis=1) @ across.T).reshape(cells, cells)
-        # blur the grid, and fade it out towards its edge
-        fade = np.clip(np.minimum(np.arange(cells), np.arange(cells)[::-1]) / (0.2 * cells), 0, 1)
-        dark = (0.46 * gaussian_filter(dark, 0.02 * cells) * fade[:, None] * fade).astype(np.float32)
-        # where each ray meets the floor, in cells of the grid
-        upward = self.vertical.astype(np.float32)
-        fall = np.minimum(directions @ upward, -1e-6)
-        far = (np.float32(self.floor) - origins @ upward) / fall
-        place = (origins + far[:, None] * directions) @ across.astype(np.float32)
-        place = (place - low.astype(np.float32)) * ((cells - 1) / (high - low)).astype(np.float32)
-        on_floor = (far > 0) & (directions @ upward < 0)
-        inside = np.flatnonzero(on_floor & ((place > 0) & (place < cells - 1)).all(axis=1))
-        alpha = np.zeros(len(origins), dtype=np.float32)
-        alpha[inside] = map_coordinates(dark, place[inside].T, order=1)
-        return alpha
-
-    def _floor_darkness(self, across: np.ndarray) -> np.ndarray:
-        """Compute the share of sky and key light that the scene takes from points (n, 3) of the floor."""
-        points = across + self.floor * self.vertical
-        normals = np.broadcast_to(self.vertical, points.shape)
-        sky = 1 - self._open(points, normals, sphere_directions(120), 4 * self.size)
-        key = _unit(np.array(KEY[0])) @ self.axes
-        # raise a low key light, so that the shadow does not become longer than the body
-        key = _unit(key + max(0.0, 1.3 - float(key @ self.vertical)) * self.vertical)
-        return sky + 0.40 * (1 - self._open(points, normals, cone_directions(key, 0.22, 32), 4 * self.size))
 
 
 def _merge_shapes(shapes: Sequence[LitTriangles]) -> tuple[np.ndarray, np.ndarray]:
@@ -195,7 +158,6 @@ class Canvas:
         self.color = np.zeros((count, 3), dtype=np.float32)       # linear light times alpha
         self.alpha = np.zeros(count, dtype=np.float32)
         self.depth = np.full(count, np.inf, dtype=np.float32)
-        self.floor: np.ndarray | None = None                      # opacity of the shadow on the floor, one per pixel
 
     def cover(self, seen: Seen, opacity: float = 1.0, through: float = 0.0) -> None:
         """Paint what is nearer than what is there; with the alpha `through`, also what is hidden.
@@ -219,8 +181,6 @@ class Canvas:
             return np.add.reduce(parts) / len(parts)
 
         color, alpha = mean(self.color), mean(self.alpha)
-        if self.floor is not None:
-            alpha = alpha + (1 - alpha) * self.floor.reshape(height, width, 1)
         # blend with white in display values, so that shadows fade evenly
         inked = as_seen(np.divide(color, alpha, out=np.zeros_like(color), where=alpha > 0))
         return np.clip(255 * (inked * alpha + 1 - alpha) + 0.5, 0, 255).astype(np.uint8)

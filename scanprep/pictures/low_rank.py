@@ -10,8 +10,8 @@ FIRST, MORE = 60, 20                 # frames that the columns are made from at 
 MOST = 400                           # frames at most: beyond, the eigenvalue problem takes too long
 
 
-def low_rank(frames: np.ndarray, tolerance: float = TOLERANCE) -> tuple[np.ndarray, np.ndarray]:
-    """Factor frames (T, n, 3), metres, into columns (n, r) and coefficients (T, r, 3), within a tolerance.
+def low_rank(frames: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Factor frames (T, n, 3), metres, into columns (n, r) and coefficients (T, r, 3), within half a millimetre.
 
     A body made of turning parts has no more columns than its model, however long it moves: `Y = B C` with the rotations
     in C. So the columns come from some of the frames, and from those that they do not reproduce.
@@ -20,8 +20,6 @@ def low_rank(frames: np.ndarray, tolerance: float = TOLERANCE) -> tuple[np.ndarr
     ----------
     frames : (T, n, 3) float, metres
         Points of every frame.
-    tolerance : float, metres
-        Largest error at any point.
 
     Returns
     -------
@@ -40,18 +38,18 @@ def low_rank(frames: np.ndarray, tolerance: float = TOLERANCE) -> tuple[np.ndarr
     count, points = frames.shape[:2]
     chosen = spread_indices(count, FIRST)
     while True:
-        basis = _columns(frames[chosen], tolerance)
+        basis = _columns(frames[chosen])
         coefficients = np.einsum("nr,tnc->trc", basis, frames, optimize=True)
         # frames that the columns do not reproduce join the ones they are computed from, the worst first
         errors = np.array([np.abs(basis @ c - frame).max(initial=0)
                            for c, frame in zip(coefficients, frames, strict=True)])
-        failing = np.setdiff1d(np.flatnonzero(errors > tolerance), chosen)
+        failing = np.setdiff1d(np.flatnonzero(errors > TOLERANCE), chosen)
         if not len(failing) or len(chosen) >= MOST or basis.shape[1] == points:
             return basis, coefficients
         chosen = np.union1d(chosen, failing[np.argsort(-errors[failing])][:MORE])
 
 
-def _columns(frames: np.ndarray, tolerance: float) -> np.ndarray:
+def _columns(frames: np.ndarray) -> np.ndarray:
     """Compute the fewest orthonormal columns (n, r) that reproduce some frames within half the tolerance."""
     stacked = frames.transpose(1, 0, 2).reshape(frames.shape[1], -1)
     # singular value decomposition by the small Gram matrix
@@ -64,5 +62,5 @@ def _columns(frames: np.ndarray, tolerance: float) -> np.ndarray:
     while low < high:
         rank = (low + high) // 2
         off = np.abs((left[:, :rank] * sizes[:rank]) @ vectors[:, :rank].T - stacked).max()
-        low, high = (low, rank) if off <= tolerance / 2 else (rank + 1, high)
+        low, high = (low, rank) if off <= TOLERANCE / 2 else (rank + 1, high)
     return np.linalg.qr(left[:, :low])[0]

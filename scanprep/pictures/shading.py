@@ -92,8 +92,7 @@ class Moving:
 Shape = Mesh | Solid | Dots | Bones
 
 
-def render(shapes: Shape | Sequence[Shape], camera: Camera, width: int, height: int, ground: bool = False
-           ) -> np.ndarray:
+def render(shapes: Shape | Sequence[Shape], camera: Camera, width: int, height: int) -> np.ndarray:
     """Render a shaded picture on a white background.
 
     Parameters
@@ -104,8 +103,6 @@ def render(shapes: Shape | Sequence[Shape], camera: Camera, width: int, height: 
         Where it is seen from.
     width, height : int, pixels
         Size of the picture.
-    ground : bool
-        Draw a soft shadow on the floor below the lowest point.
 
     Returns
     -------
@@ -117,10 +114,7 @@ def render(shapes: Shape | Sequence[Shape], camera: Camera, width: int, height: 
     # opaque shapes in one search tree, so that they cast shadows on each other
     solid = [s for s in everything if not _on_top(s) and _opacity(s) == 1]
     if solid:
-        scene = _scene(solid, camera)
-        canvas.cover(scene.cast(origins, directions))
-        if ground and np.isfinite(scene.floor):
-            canvas.floor = scene.ground_shadow(*camera.rays(width, height))
+        canvas.cover(_scene(solid, camera).cast(origins, directions))
     # translucent shapes are blended over them, and what is on top shows through all
     for shape in everything:
         if _opacity(shape) < 1:

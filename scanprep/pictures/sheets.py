@@ -21,8 +21,8 @@ def font(size: int):
     return ImageFont.load_default(size=size)
 
 
-def contact_sheet(images: Sequence[np.ndarray], labels: Sequence[str] | None = None, gap: int = 8,
-                  columns: int | None = None) -> np.ndarray:
+def contact_sheet(images: Sequence[np.ndarray], labels: Sequence[str] | None = None, columns: int | None = None
+                  ) -> np.ndarray:
     """Put pictures of any size side by side, each centred in its cell with a line of text below.
 
     Parameters
@@ -31,8 +31,6 @@ def contact_sheet(images: Sequence[np.ndarray], labels: Sequence[str] | None = N
         The pictures.
     labels : sequence of str, optional
         One for each picture.
-    gap : int, pixels
-        Space between cells.
     columns : int, optional
         Pictures in a row; by default all.
 
@@ -46,6 +44,7 @@ def contact_sheet(images: Sequence[np.ndarray], labels: Sequence[str] | None = N
         raise ValueError("images: expected at least one, got none")
     if labels is not None and len(labels) != len(images):
         raise ValueError(f"labels: expected {len(images)}, one for each image, got {len(labels)}")
+    gap = 8  # pixels between cells
     columns, labels = min(columns or len(images), len(images)), [printable(label) for label in labels or ()]
     # the widest picture or label sets the width of all cells, the highest picture of a row its height
     rows = -(-len(images) // columns)
@@ -83,8 +82,9 @@ def webp_bytes(image: np.ndarray) -> bytes:
     return out.getvalue()
 
 
-def small_picture(path: Path, width: int = 700) -> bytes:
-    """Read a picture from a file and encode it as WebP, no wider than `width` pixels."""
+def small_picture(path: Path) -> bytes:
+    """Read a picture from a file and encode it as WebP, no wider than a page of many results shows it."""
+    width = 700  # pixels
     with open_image(path, "a picture") as image:
         image.thumbnail((width, width))
         return webp_bytes(np.asarray(image.convert("RGB")))
