@@ -3,15 +3,14 @@
 import numpy as np
 import pytest
 from completion_bodies import MEAN, worm_with_prior
-from marker_faults import CONFIG, FRAMES, LABELS, RATE, exchanged
+from marker_faults import FRAMES, LABELS, RATE, exchanged
 
 from completion import smoothing
-from completion.mocap.artefacts import find
 from completion.mocap.artefacts.find import Simulation, ambiguous_swap, bridge_gaps, find_artefacts
 from completion.mocap.files.markers import MarkerSequence
 from completion.mocap.marker_sets.layout import MarkerLayout
 from completion.mocap.mosh.pictures import chart_artefacts
-from completion.mocap.pose import follow, marked_body, swaps
+from completion.mocap.pose import marked_body, swaps
 from completion.mocap.pose.follow import AnimateConfig, animate
 from completion.mocap.pose.marked_body import MarkedBody
 from completion.mocap.pose.swaps import Tracks, find_order
@@ -56,7 +55,7 @@ def neighbours(positions):
 def test_a_clean_sequence_has_no_faults(subject, layout, moved):
     _, _, positions, _ = moved
     ticks = []
-    found = find_artefacts(subject, changed(positions), layout, CONFIG, progress=lambda *at: ticks.append(at))
+    found = find_artefacts(subject, changed(positions), layout, progress=lambda *at: ticks.append(at))
     assert found.swaps == () and found.bad == () and len(ticks) == 1
     np.testing.assert_array_equal(found.repaired.positions, positions)
     assert np.linalg.norm(found.simulated - positions, axis=2).max() < 0.008 and found.weights.min() > 0.9
@@ -74,7 +73,7 @@ def test_faults_of_all_kinds_together(subject, layout, moved):
     faulty[40:100, noisy] += np.random.default_rng(2).normal(0, 0.01, (60, 3))
     faulty[90:120, stray] += [0.2, -0.1, 0.1]
     faulty[30:60, gone] = np.nan
-    found = find_artefacts(subject, changed(faulty), layout, CONFIG)
+    found = find_artefacts(subject, changed(faulty), layout)
     assert {(frozenset((e.first, e.second)), e.begin, e.end) for e in found.swaps} == {
         (frozenset((LABELS[a], LABELS[b])), 20, 79), (frozenset((LABELS[a], LABELS[far])), 100, 140)}
     spans = {s.label: s for s in found.bad}
@@ -101,34 +100,30 @@ def test_the_motion_of_repaired_markers_is_the_clean_one(subject, layout, moved)
         begin = int(rng.integers(0, 100))
         exchanged(faulty, a, b, begin, begin + int(rng.integers(20, 50)))
     meshes = subject.vertices(poses, trans)
-    found = find_artefacts(subject, changed(faulty), layout, CONFIG)
+    found = find_artefacts(subject, changed(faulty), layout)
     assert len(found.swaps) == 6
 
     def error(sequence):
-        motion = animate(subject, sequence, layout, AnimateConfig())
+        motion = animate(subject, sequence, layout)
         return np.linalg.norm(motion.vertices(subject) - meshes, axis=2).mean()
 
     assert error(found.repaired) < 1.05 * error(changed(positions))
-    given = find_artefacts(subject, changed(positions), layout, CONFIG, animate(subject, changed(positions), layout,
-                                                                             AnimateConfig()))
+    given = find_artefacts(subject, changed(positions), layout, animate(subject, changed(positions), layout))
     assert given.swaps == () and given.bad == ()
 
 
-def test_what_a_person_before_has_told_is_begun_with(subject, layout, moved, monkeypatch):
-    """The same is found, and no key frame is followed for it."""
+def test_what_a_person_before_has_told_is_begun_with(subject, layout, moved):
     _, _, positions, turns = moved
     faulty = positions.copy()
     exchanged(faulty, *neighbours(positions)[:2], 40, 99)
     faulty[60:, 20] += turns[60:, 20] @ [0.03, 0, 0]
-    first = find_artefacts(subject, changed(faulty), layout, CONFIG)
-    motion = animate(subject, first.repaired, layout, AnimateConfig())
-    monkeypatch.setattr(find, "between_keys", None)
-    monkeypatch.setattr(follow, "between_keys", None)
-    again = find_artefacts(subject, changed(faulty), layout, CONFIG, motion, known=first)
+    first = find_artefacts(subject, changed(faulty), layout)
+    motion = animate(subject, first.repaired, layout)
+    again = find_artefacts(subject, changed(faulty), layout, motion, known=first)
     assert [vars(e) for e in again.swaps] == [vars(e) for e in first.swaps]
     assert [(b.label, b.kind, b.begin) for b in again.bad] == [(b.label, b.kind, b.begin) for b in first.bad]
     np.testing.assert_array_equal(again.repaired.positions, first.repaired.positions)
-    near = animate(subject, first.repaired, layout, AnimateConfig(), near=motion)
+    near = animate(subject, first.repaired, layout, near=motion)
     assert np.linalg.norm(near.vertices(subject) - motion.vertices(subject), axis=2).max() < 1e-3
 
 
@@ -166,7 +161,7 @@ def test_an_exchange_with_a_label_that_no_layout_knows(subject, layout, moved):
     few = layout.select(LABELS[:25])
     faulty = positions.copy()
     exchanged(faulty, 3, 28, 50, 99)
-    found = find_artefacts(subject, changed(faulty), few, CONFIG)
+    found = find_artefacts(subject, changed(faulty), few)
     assert [(e.first, e.second, e.begin, e.end) for e in found.swaps] == [("M3", "M28", 50, 99)]
     np.testing.assert_array_equal(found.repaired.positions, positions)
     assert found.labels == LABELS[:25] and found.bad == ()
@@ -216,6 +211,6 @@ def test_bridges_join_both_ends_and_long_ones_pass_the_usual_place():
 
 def test_a_motion_of_other_length_is_refused(subject, layout, moved):
     _, _, positions, _ = moved
-    motion = animate(subject, changed(positions).frames(slice(0, 20)), layout, AnimateConfig())
+    motion = animate(subject, changed(positions).frames(slice(0, 20)), layout)
     with pytest.raises(ValueError, match="motion: expected 160 frames as the markers have, got 20"):
-        find_artefacts(subject, changed(positions), layout, CONFIG, motion)
+        find_artefacts(subject, changed(positions), layout, motion)

@@ -16,7 +16,7 @@ from scanprep.batch.room import TaskContext
 from scanprep.batch.workspace import HOME
 
 HERE = Path()
-BOB = ("people/bob", "--subjects", "all")
+BOB = ("people/bob/jump.csv",)
 PERSON = {"start", "solve"}
 ALL = PERSON | {"poses", "artefacts", "soft", "files", "page", "person page"}
 
@@ -73,7 +73,7 @@ def test_killed_in_the_middle_of_a_recording_it_goes_on(copied, stage, call, kep
     ((), {}, set()), ((), {"exaggeration": 1.5}, {"files", "page", "person page"}),
     ((), {"soft": {"reach": 0.12}}, {"soft", "files", "page", "person page"}),
     ((), {"poses": {"prior_weight": 0.2}}, ALL - PERSON), ((), {"person": {"shape": 0.4}}, ALL),
-    (("--hold-out", "M7"), {}, ALL), (("--force",), {}, ALL)])
+    (("--force",), {}, ALL)])
 def test_what_depends_on_a_changed_setting_is_done_anew(copied, words, settings, anew):
     check(copied, anew, words, settings)
 
@@ -127,16 +127,17 @@ def test_workers_of_a_cluster_keep_no_steps_and_write_the_same(copied, monkeypat
 def test_a_recording_less_takes_its_folder_away(place, tmp_path):
     people, out = tmp_path / "people", tmp_path / "out"
     shutil.copytree(place / "people", people)
-    assert run(place, people / "ann", "--subjects", "all", "-o", out, soft_tissue=False) == 0
+    shutil.rmtree(people / "bob")
+    assert run(place, people, "-o", out, soft_tissue=False) == 0
     (out / "ann" / "walk" / "notes.txt").write_text("mine")
     (people / "ann" / "run.csv").unlink()
-    assert run(place, people / "ann", "--subjects", "all", "-o", out, soft_tissue=False) == 0
+    assert run(place, people, "-o", out, soft_tissue=False) == 0
     assert not (out / "ann" / "run").exists() and (out / "ann" / "walk" / "notes.txt").read_text() == "mine"
 
 
 def test_what_is_not_of_scapekit_stays(copied, capsys):
     out = copied / "whole"
-    (out / "bob" / "jump" / "animation.glb").write_bytes(b"mine")
+    (out / "jump" / "jump" / "animation.glb").write_bytes(b"mine")
     before = contents(out)
     with counted() as calls:
         assert run(HERE, *BOB, "-o", "whole", exaggeration=1.5) == 1
@@ -151,13 +152,13 @@ def test_what_is_not_of_scapekit_stays(copied, capsys):
 def test_a_mended_table_is_never_overwritten(copied, capsys):
     out = copied / "whole"
     table = out / "subjects.csv"
-    mended = table.read_text().replace(",bob,", ",rob,")
+    mended = table.read_text().replace(",jump,", ",rob,")
     table.write_text(mended)
     before = contents(out)
     assert run(HERE, *BOB, "-o", "whole") == 1
     assert "whole/subjects.csv: was mended; go by it with --subjects whole/subjects.csv" in capsys.readouterr().err
     assert contents(out) == before
-    assert run(HERE, "people/bob", "-o", "whole", "--subjects", table, soft_tissue=False) == 0
+    assert run(HERE, *BOB, "-o", "whole", "--subjects", table, soft_tissue=False) == 0
     assert table.read_text() == mended and (out / "rob" / "jump" / "motion.npz").exists()
 
 
@@ -180,7 +181,7 @@ def test_figures_that_mean_nothing_are_a_failure(place, tmp_path, monkeypatch, c
     done = QuietWork.__call__
     monkeypatch.setattr(QuietWork, "__call__", lambda *given: (
         [Metric("judgement", "failed: half the body was missed: unit?"), *(found := done(*given))[0]], found[1]))
-    assert run(place, place / "people" / "bob", "--subjects", "all", "-o", tmp_path / "out", soft_tissue=False) == 1
-    assert "failed: bob: half the body was missed: unit?" in capsys.readouterr().err
-    assert (tmp_path / "out" / "bob" / "jump" / "motion.npz").exists()
+    assert run(place, place / "people" / "bob" / "jump.csv", "-o", tmp_path / "out", soft_tissue=False) == 1
+    assert "failed: jump: half the body was missed: unit?" in capsys.readouterr().err
+    assert (tmp_path / "out" / "jump" / "jump" / "motion.npz").exists()
     assert "half the body was missed" in (tmp_path / "out" / "report.html").read_text()

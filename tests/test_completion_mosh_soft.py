@@ -10,6 +10,7 @@ from conformance_bodies import KINDS
 from derivatives import differences
 
 from completion import MarkerLayout, MarkerSequence, Motion, follow_soft_tissue
+from completion.mocap.pose.foot_contact import Floor
 from completion.mocap.pose.marked_body import supports
 from completion.mocap.soft_tissue import follow
 from completion.mocap.soft_tissue.follow import ShapeFollower, SkinFollower, SoftTissueConfig, variances, whiten
@@ -214,9 +215,8 @@ def test_the_world_may_be_turned() -> None:
     poses[:, 0] = rotations.log(R @ rotations.exp(poses[:, 0]))
     elsewhere = fixed(poses, (motion.trans + origin) @ R.T + shift - origin, where)
     turned = replace(markers, positions=markers.positions @ R.T + shift)
-    alike = SoftTissueConfig(outlier=100.0)        # weights of outliers are of coordinates, which turn with the world
-    one = follow_soft_tissue(model, motion, markers, where, alike)
-    other = follow_soft_tissue(model, elsewhere, turned, where, alike)
+    one = follow_soft_tissue(model, motion, markers, where)
+    other = follow_soft_tissue(model, elsewhere, turned, where)
     np.testing.assert_allclose(other.skin.moved, one.skin.moved, rtol=0, atol=1e-4)
     np.testing.assert_allclose(other.vertices(model), one.vertices(model) @ R.T + shift, rtol=0, atol=1e-4)
 
@@ -358,7 +358,7 @@ def test_what_does_not_belong_together_is_refused() -> None:
             follow_soft_tissue(model, wrong, markers, where)
     with pytest.raises(ValueError, match="48 frames, 80 labels"):
         follow_soft_tissue(model, motion, markers.frames(slice(0, 5)), where)
-    for name, value in (("marker_sd", 0.0), ("reach", -1.0), ("temporal_smoothness", -1.0)):
+    for name, value in (("reach", -1.0), ("temporal_smoothness", -1.0)):
         with pytest.raises(ValueError, match=f"{name}: expected|config"):
             SkinFollower(model, motion, markers, where, SoftTissueConfig(**{name: value}))
     with pytest.raises(ValueError, match="k at most 3"):
@@ -369,16 +369,16 @@ def test_what_stands_on_the_floor_does_not_slide_while_the_skin_moves():
     model, rng = body(), np.random.default_rng(6)
     poses = np.repeat(model.pose_mean[None], T, axis=0)
     poses[:, -1, 2] += 0.2 * np.sin(np.arange(T) / 8)                                          # the rest stands still
-    where = layout(model, 0.0)
+    where = layout(model, 0.0, 40)
     motion = fixed(poses, np.zeros((T, 3)), where)
     own = model.subject(OWN)
     truth = motion.vertices(own)
     placed = np.stack([where.place(model.template.with_vertices(v)) for v in truth])
     markers = MarkerSequence(placed + rng.normal(0, 0.005, placed.shape), where.labels, RATE)
-    low = truth[..., 2].min()
-    free, held = (follow_soft_tissue(model, motion, markers, where, ground=ground, floor=(0, 0, 1, low))
+    floor = Floor.below(truth)
+    free, held = (follow_soft_tissue(model, motion, markers, where, ground=ground)
                   .motion.vertices(own) for ground in (False, True))
-    soles = np.flatnonzero((truth[..., 2] < low + 0.01).all(axis=0))
+    soles = np.flatnonzero((floor.above(truth) < 0.01).all(axis=0))
     slide = [np.linalg.norm(np.diff(v[:, soles], axis=0), axis=2).mean() for v in (free, held)]
     assert slide[1] < 0.5 * slide[0]
     assert np.linalg.norm(held - truth, axis=2).mean() < 1.05 * np.linalg.norm(free - truth, axis=2).mean()

@@ -282,10 +282,10 @@ def test_feet_that_stand_do_not_slide(walker):
 
 def test_feet_do_not_sink_while_walking(walker):
     truth, free = animated(walker, "walk")
-    height = float(np.median(truth[..., 2].min(axis=1))) + 0.01      # a floor a little too high
-    _, held = animated(walker, "walk", ground=True, floor=(0.0, 0.0, 2.0, height))
+    height = Floor.below(free).height
+    _, held = animated(walker, "walk", ground=True)
     sunk_free, sunk = (np.maximum(0, height - v[..., 2].min(axis=1)) for v in (free, held))
-    assert sunk_free.mean() > 0.006 and sunk.mean() < 0.6 * sunk_free.mean()
+    assert sunk.mean() < 0.6 * sunk_free.mean()
     assert np.linalg.norm(held - truth, axis=2).mean() < 0.02
 
 
@@ -296,8 +296,6 @@ def test_the_floor_is_found_whatever_axis_is_up(walker):
     assert floor.normal.tolist() == [0, 0, 1] and abs(floor.height - np.median(vertices[..., 2].min(axis=1))) < 0.01
     turned = Floor.below(vertices @ rotations.exp(np.array([np.pi / 2, 0, 0])).T)  # z becomes -y
     assert turned.normal.tolist() == [0, -1, 0] and abs(turned.height - floor.height) < 1e-9
-    with pytest.raises(ValueError, match="expected a normal and a height"):
-        Floor.from_numbers((0, 0, 0, 1))
 
 
 def test_what_stands_is_held_on_the_floor_and_the_rest_is_free(walker):
@@ -308,10 +306,8 @@ def test_what_stands_is_held_on_the_floor_and_the_rest_is_free(walker):
     places = feet.target_positions(x)
     held = ~np.isnan(places[..., 0])
     assert held.all(axis=0).sum() >= 4 and (feet.floor.above(places[held]) > -1e-9).all()
-    raised = x.copy()
-    raised[:, -1] += 1
-    floor = *feet.floor.normal, feet.floor.height
-    assert np.isnan(FootContact(body, raised, 60.0, floor).target_positions(raised)).all()
+    x[40:, -1] += 1                                                  # as if standing in the air
+    assert np.isnan(FootContact(body, x, 60.0).target_positions(x)[45:]).all()
 
 
 def test_a_motion_keeps_which_markers_were_trusted(tmp_path):

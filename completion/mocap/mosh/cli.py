@@ -23,7 +23,7 @@ from ..files.markers import resolve_marker_unit
 from ..marker_sets.named import choose_layout
 from .call import MoshCall
 from .mosh import MoshConfig
-from .recordings import TABLE, Actor, Grouping, write_grouping
+from .recordings import TABLE, Actor, subjects_table, write_grouping
 from .work import ERRORS, FIXED, MoshTask
 
 MarkersArg = Annotated[tuple[Path, ...], Place("MARKERS [MARKERS ...]")]
@@ -31,7 +31,7 @@ Models = Annotated[tuple[Path, ...], Alias("-m", each=True)]
 
 
 def mosh_markers(markers: MarkersArg, output: Output, model: Models = (), layout: str | None = None,
-                 subject_prefix: Annotated[str, Called("--subjects")] = "auto", hold_out: tuple[str, ...] = (),
+                 subject_prefix: Annotated[str, Called("--subjects")] = "auto",
                  retarget_to: Annotated[Path | None, Called("--character")] = None, unit: PersonUnit | None = None,
                  rate: Positive | None = None, unlabelled: bool = False, static: Path | None = None,
                  config: MoshConfig = MoshConfig(),
@@ -53,11 +53,10 @@ def mosh_markers(markers: MarkersArg, output: Output, model: Models = (), layout
     and foot offs, those of the C3D file if it has them) and gait_cycles.csv (joint angles over the gait cycle). Of a
     C3D file with force plates also grf.mot (forces for OpenSim).
 
-    Files that are named are of one person. In a folder every sub-folder is a person; of files that lie side by side
-    those are, whose names begin with the same number, as 85_02.c3d and 85_03.c3d, or else whose labels begin with the
-    same `Subject:`. Several people in one file, Ann:LKNE and Bob:LKNE, have a folder each; a prop beside them is left
-    out. What was found is printed, and kept in subjects.csv, which --subjects takes when it is mended. Called again,
-    the command leaves alone what is done and has not changed; killed, it goes on where it was.
+    Files that are named are of one person. In a folder every sub-folder is a person, and so is every file beside
+    them. Several people in one file, Ann:LKNE and Bob:LKNE, have a folder each; a prop beside them is left out. What
+    was found is printed, and kept in subjects.csv, which --subjects takes when it is mended. Called again, the command
+    leaves alone what is done and has not changed; killed, it goes on where it was.
 
     Args:
         markers: C3D, TRC, CSV or TSV files, or folders of these.
@@ -67,11 +66,8 @@ def mosh_markers(markers: MarkersArg, output: Output, model: Models = (), layout
         layout: Where the markers usually sit: one of `scape layout list`, or a JSON file {"markersets":
             [{"distance_from_skin": metres, "indices": {label: vertex}}]}. Without it the named one that fits best.
         subject_prefix: Who is who: a CSV file with the columns file and subject, or JSON {file: subject}, where files
-            that are left out are not used; or a rule: "name", by what stands before the first _, - or blank of the file
-            name; "label", by what stands before the colon of the labels; "each", every file is of another person;
-            "all", they are of one; "auto". Or whose markers, in files with several people: what stands before the
+            that are left out are not used. Or whose markers, in files with several people: what stands before the
             colon of the labels, as Ann; several, as Head,Trunk, are of one person.
-        hold_out: Labels of markers that no stage sees, which then tell how well the body predicts.
         retarget_to: Model whose mean is a character, which makes the motion too: character.glb.
         unit: Unit of the markers, where the file cannot tell; "unknown": that in which they span a person.
         rate: Frames a second, where a file does not say or says it wrongly.
@@ -83,11 +79,10 @@ def mosh_markers(markers: MarkersArg, output: Output, model: Models = (), layout
     """
     if not markers:
         raise ValueError("MARKERS: expected at least one file or folder")
-    held = tuple(label for words in hold_out for label in words.split(",") if label)
     if unlabelled and layout is None:
         raise UsageError("--unlabelled: expected --layout: which markers are worn, of scape layout list")
     units = resolve_marker_unit(markers, unit)
-    call = MoshCall(markers, model, layout, subject_prefix, held, retarget_to, units, rate, unlabelled, static, config)
+    call = MoshCall(markers, model, layout, subject_prefix, retarget_to, units, rate, unlabelled, static, config)
     with bar("people") as people, bar("one of them") as inside:
         return carry_out(call, space, workers, f"scape mosh {' '.join(sys.argv[2:])}", people, inside)
 
@@ -96,14 +91,14 @@ def carry_out(call: MoshCall, space: Workspace, workers: Workers, command: str, 
     """Run what has changed of a call in an open output; `tell` reports progress over people, and within one."""
     actors, loaded = call.actors(space.folder), call.models()
     work = MoshTask(loaded.neutral, loaded.name, loaded.sexes, loaded.character,
-                    None if call.layout is None else choose_layout(loaded.neutral, call.layout, ()), call.hold_out,
+                    None if call.layout is None else choose_layout(loaded.neutral, call.layout, ()),
                     call.unit, call.rate, call.unlabelled, call.static, call.config, command)
     # write the grouping to subjects.csv; one that the user edited stays, and has to be named with --subjects
     table = space.folder / TABLE
     if not table.exists() or space.is_ours(TABLE):
         with space.staging("people") as staged:
             write_grouping(staged.folder / TABLE, actors)
-    elif Grouping.of(call.subjects).table is not None:
+    elif subjects_table(call.subjects) is not None:
         warnings.warn(f"{table}: left as it was mended", stacklevel=2)
     else:
         raise ValueError(f"{table}: was mended; go by it with --subjects {table}, or move it away")
@@ -137,7 +132,7 @@ def describe(call: MoshCall, model: str, actors: Sequence[Actor]) -> FolderComma
 
     return FolderCommand(
         ("person", "people"), "{} from markers", _summary, lambda rows: figure(rows, FIXED),
-        {"mosh": call.config, "model": model, "layout": call.layout, "held out": call.hold_out}, lines,
+        {"mosh": call.config, "model": model, "layout": call.layout}, lines,
         "A marker that sits elsewhere than the layout has it, labels that are exchanged, a marker that should not be "
         "used: open this folder with `scape view` and press `mend` to put them right and run again.", call)
 

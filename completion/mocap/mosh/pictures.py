@@ -30,7 +30,7 @@ from ..files.markers import MarkerSequence
 from ..marker_sets.layout import MarkerLayout
 from .takes import Take
 
-USUAL, UNCERTAIN, UNUSED = (0.30, 0.50, 0.72), (0.93, 0.62, 0.16), (0.20, 0.62, 0.32)
+USUAL, UNCERTAIN = (0.30, 0.50, 0.72), (0.93, 0.62, 0.16)
 LITTLE = 0.005                       # metres: least end of a colour scale, so that tiny changes stay pale
 
 
@@ -55,18 +55,16 @@ def person_pane(body: Mesh, found: np.ndarray, usual: np.ndarray, labels: Sequen
 
 def kinds_of_markers(take: Take) -> dict[str, tuple[Sequence[float], np.ndarray]]:
     """Return kind -> colour and positions (T, L, 3) of the measured markers of that kind, NaN elsewhere."""
-    # used markers are those with residuals; held-out ones are not used
-    held = np.isin(take.markers.labels, () if take.held is None else take.held.labels)
-    used = np.isfinite(take.motion.residuals).any(axis=0) & ~held
+    used = np.isfinite(take.motion.residuals).any(axis=0)
     kinds = {"believed markers": (MARKER, take.motion.trusted & used),
-             "not believed": (UNCERTAIN, ~take.motion.trusted & used), "held-out markers": (UNUSED, held)}
+             "not believed": (UNCERTAIN, ~take.motion.trusted & used)}
     found = {name: (color, np.where(np.broadcast_to(which, take.motion.trusted.shape)[..., None],
                                     take.markers.positions, np.nan)) for name, (color, which) in kinds.items()}
     return {name: (color, at) for name, (color, at) in found.items() if np.isfinite(at).any()}
 
 
 def take_marker_dots(take: Take, t: int, radius: float = 0.014) -> list[Dots]:
-    """Return the measured markers of a frame as dots: trusted, distrusted and held-out ones."""
+    """Return the measured markers of a frame as dots: trusted and distrusted ones."""
     return [Dots(at[t], color, radius, name=name) for name, (color, at) in kinds_of_markers(take).items()]
 
 
@@ -150,14 +148,12 @@ def _average_stretches(values: np.ndarray, most: int = 900) -> np.ndarray:
 
 
 def chart_frames(take: Take) -> Any:
-    """Plot the mean distance of the markers over time: fixed shape, soft tissue, held-out markers."""
+    """Plot the mean distance of the markers over time: fixed shape, soft tissue."""
     # one line each, averaged to a readable number of points
     figure, axes = chart(7.8, 2.7)
     lines = [("fixed shape", take.motion.residuals, "#7a8794")]
     if take.soft is not None:
         lines.append(("with soft tissue", take.soft.motion.residuals, "#c8452f"))
-    if take.held is not None:
-        lines.append(("held-out markers", take.held.shown, "#2f8f4e"))
     for label, residuals, color in lines:
         values = mean_over(residuals, 1)
         shown = _average_stretches(MM * values)

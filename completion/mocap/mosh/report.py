@@ -82,12 +82,12 @@ def person_page(name: str, model: BodyModel, result: MoshResult, usual: MarkerLa
 
 def take_page(take: Take, metrics: Sequence[Metric], picture: np.ndarray, walk: Walk) -> Page:
     """Make the page of a sequence: motion, gait, distances of markers, soft tissue, artefacts; `closing` ends it."""
-    motion, held, artefacts = take.motion, take.held, take.artefacts
+    motion, artefacts = take.motion, take.artefacts
     # 56 frames in which soft tissue is measured
     frames = spread_indices(len(take.shown.poses), 56)
     page = Page(f"{take.name}, with {'soft tissue' if take.soft else 'fixed shape'}",
                 "Dots are the measured markers: red where they are believed, orange where they are seen but not "
-                "believed, green for held-out markers, which no stage has seen.")
+                "believed.")
     page.table([(m.name, m.text(), m.unit) for m in _main(metrics)])
     page.section("The whole sequence").bodies(
         [pictures.take_pane(take)], "Press the triangle to play, drag the body to turn it; it is kept in the middle.",
@@ -99,16 +99,13 @@ def take_page(take: Take, metrics: Sequence[Metric], picture: np.ndarray, walk: 
                                 "as bad")
     page.bodies(pictures.take_frame_panes(take, worst_frames(take.shown, 5)), "the frames in which they are farthest",
                 300)
-    # a table of markers, the worst first, held-out ones on top
+    # a table of markers, the worst first
     rows = marker_rows(motion.labels, motion.residuals, None if take.soft is None else take.soft.motion.residuals,
                        motion.trusted)
-    if held is not None:
-        rows = marker_rows([f"{label} (held out)" for label in held.labels], held.fixed, held.soft, None) + rows
     page.table(rows, ("marker", "fixed shape (mm)", "soft tissue (mm)", "95th percentile (mm)", "seen (%)",
                       "believed (%)"))
     used = np.isfinite(motion.residuals).any(axis=0)
-    unused = [label for label, is_used in zip(motion.labels, used, strict=True)
-              if not is_used and (held is None or label not in held.labels)]
+    unused = [label for label, is_used in zip(motion.labels, used, strict=True) if not is_used]
     if unused:
         page.text(f"Not used, because the layout does not know them or they were never seen: {', '.join(unused)}.")
     if take.soft is not None:

@@ -16,7 +16,6 @@ from model.learning.sexes import SexGuess
 from model.linear import Subject
 from model.motion.files import skeleton_arrays
 from model.people import person_judgement
-from scanprep.arguments import UsageError
 from scanprep.batch.room import TaskContext
 from scanprep.cli import MM
 from scanprep.console import Metric, Outcome, details, judgement_row, write_report
@@ -59,12 +58,11 @@ from .mosh import MoshConfig, MoshResult, clocks, mosh, mosh_by_sex
 from .pictures import person_in_mean_pose
 from .recordings import Actor, Recording
 from .report import closing, person_page, person_picture, take_page, take_picture
-from .takes import LightMesh, Take, Walk, measure_held_out
+from .takes import LightMesh, Take, Walk
 
-# held-out errors first; what is left after soft tissue was fitted to the same markers is small, and no error
-ERRORS = ("held-out error, fixed shape", "held-out error, soft tissue", "markers to the body, fixed shape",
-          "left over after soft tissue was fitted")
-FIXED = ERRORS[2]                    # the one that every person has
+# what is left after soft tissue was fitted to the same markers is small, and no error
+FIXED = "markers to the body, fixed shape"
+ERRORS = (FIXED, "left over after soft tissue was fitted")
 # metres: markers of a person are 5 to 15 mm off in another recording of the same session; and degrees from upright
 SOMEBODY_ELSE, STANDING = 0.025, {"hip_flexion": 35, "hip_adduction": 25, "knee_angle": 30, "ankle_angle": 35}
 HALF = 100                           # steps of progress for shape and motion, and as many for files and pictures
@@ -79,7 +77,6 @@ class MoshTask:
     sexes: Mapping[str, BodyModel]       # models of "female" and "male" people, or empty
     character: BodyModel | None
     layout: tuple[MarkerLayout, str] | None          # with its name; None for the named one that fits labels best
-    hold_out: tuple[str, ...]            # labels of held-out markers
     unit: str | None
     rate: float | None                   # frames a second, where a file does not say
     unlabelled: bool                     # markers have no names
@@ -95,12 +92,12 @@ class MoshTask:
         start, folder = clocks(), context.folder
         outcome, failures = _solve(self, actor, context)
         solved = clocks() - start
-        settings = {"mosh": self.config, "model": self.name, "layout": outcome.layout_name, "held out": self.hold_out}
+        settings = {"mosh": self.config, "model": self.name, "layout": outcome.layout_name}
         # the person: betas and how they were found, where the markers sat
         result, person = outcome.result, outcome.result.person
         storage.write_json(folder / "subject.json", {
             "betas": result.betas.tolist(), "model": self.name, "layout": outcome.layout_name,
-            "held_out": self.hold_out, "sex": outcome.guess, "recordings": [r.path.name for r in actor.recordings],
+            "sex": outcome.guess, "recordings": [r.path.name for r in actor.recordings],
             "frames": person.frames.tolist(),
             "moved": dict(zip(result.layout.labels, person.moved.tolist(), strict=True)),
             "misplaced": {m.label: {"from_the_layout": m.before, "left": m.after} for m in result.misplaced.moved},
@@ -206,33 +203,27 @@ def _solve(work: MoshTask, actor: Actor, context: TaskContext) -> tuple[_Found, 
             failures.append(" ".join(str(error).split()))
     if not sequences:
         raise ValueError("; ".join(failures))
-    # the layout for these labels, without held-out markers
+    # the layout for these labels
     labels = tuple(dict.fromkeys(label for each in sequences for label in each.labels))
     usual, layout_name = work.layout or choose_layout(work.model, None, labels)
     usual = usual.with_spellings(labels)
-    try:
-        layout = usual.without(work.hold_out) if work.hold_out else usual
-    except ValueError as error:
-        raise UsageError(f"--hold-out: {error}") from None
     model, guess = work.model, None
 
     def progress(done: int, total: int) -> None:
         context.report_progress(HALF * done // total, 2 * HALF)
 
     if work.sexes:
-        by_sex = mosh_by_sex({"neutral": work.model, **work.sexes}, sequences, layout, work.config, progress,
+        by_sex = mosh_by_sex({"neutral": work.model, **work.sexes}, sequences, usual, work.config, progress,
                              context.step)
         model, guess, result = by_sex.model, by_sex.guess, by_sex.result
     else:
-        result = mosh(sequences, model, layout, work.config, progress, context.step)
-    # a take for each sequence, with distances from held-out markers
+        result = mosh(sequences, model, usual, work.config, progress, context.step)
+    # a take for each sequence
     subject = model.subject(result.betas)
     light, takes = LightMesh.of(model.template), []
     for i, (source, unit, markers) in enumerate(zip(recordings, units, sequences, strict=True)):
         soft = result.soft_tissue[i] if result.soft_tissue else None
-        held = measure_held_out(model, usual, work.hold_out, markers, result.motions[i], soft)
-        takes.append(Take(source, unit, model, subject, markers, result.motions[i], soft, result.artefacts[i],
-                          held, light))
+        takes.append(Take(source, unit, model, subject, markers, result.motions[i], soft, result.artefacts[i], light))
     segments = define_segments(work.config.angles, model, subject, result.layout)
     zero, doubts = _stand(work, subject, result.layout, segments) if work.static else (None, Judgement())
     return _Found(model, guess, result, takes, usual, layout_name, Judgement().merge(*labelling, doubts), segments,
@@ -263,7 +254,7 @@ def _write(work: MoshTask, found: _Found, take: Take, context: TaskContext, sett
            ) -> tuple[list[Metric], np.ndarray]:
     """Write a sequence into its folder, in steps that are kept; return figures and times (2,) of the page, seconds."""
     metrics, factor = [Metric("layout", found.layout_name), *_figures([take])], work.config.exaggeration
-    solved = found.model, take.markers, take.motion, take.soft, take.artefacts, take.held
+    solved = found.model, take.markers, take.motion, take.soft, take.artefacts
 
     def place(folder: Path) -> Path:
         (folder / take.name).mkdir(exist_ok=True)
@@ -392,9 +383,7 @@ def _figures(takes: Sequence[Take]) -> list[Metric]:
     fixed = [t.motion.residuals_of_trusted() for t in takes]
     soft = [np.where(np.isnan(t.motion.residuals_of_trusted()), np.nan,
                      t.soft.motion.residuals) for t in takes if t.soft is not None]
-    held = [t.held for t in takes if t.held is not None]
-    held_soft = [h.soft for h in held if h.soft is not None]
-    for name, values in zip(ERRORS, ([h.fixed for h in held], held_soft, fixed, soft), strict=True):
+    for name, values in zip(ERRORS, (fixed, soft), strict=True):
         if values:
             out.append(Metric(name, MM * float(np.nanmean(np.concatenate([v.ravel() for v in values]))), "mm"))
     # counts of missing, bad and filled positions
