@@ -5,15 +5,11 @@ import pytest
 from completion_bodies import MEAN, worm_with_prior
 from marker_faults import FRAMES, LABELS, RATE, exchanged
 
-from completion import smoothing
 from completion.mocap.artefacts.find import Simulation, ambiguous_swap, bridge_gaps, find_artefacts
 from completion.mocap.files.markers import MarkerSequence
 from completion.mocap.marker_sets.layout import MarkerLayout
-from completion.mocap.mosh.pictures import chart_artefacts
-from completion.mocap.pose import marked_body, swaps
-from completion.mocap.pose.follow import AnimateConfig, animate
-from completion.mocap.pose.marked_body import MarkedBody
-from completion.mocap.pose.swaps import Tracks, find_order
+from completion.mocap.pose.follow import animate
+from completion.mocap.pose.swaps import Tracks
 
 
 @pytest.fixture(scope="module")
@@ -88,8 +84,6 @@ def test_faults_of_all_kinds_together(subject, layout, moved):
     filled = found.virtual()
     assert filled.seen.all() and np.linalg.norm(filled.positions - positions, axis=2).max() < 0.012
     assert found.weights[60:, slipped].max() == 0 and found.weights[:60, slipped].min() > 0.5
-    titles = [axis.get_ylabel() for axis in chart_artefacts(found, changed(faulty)).axes]
-    assert sorted(titles) == sorted({*spans, LABELS[a], LABELS[b], LABELS[far]})
 
 
 def test_the_motion_of_repaired_markers_is_the_clean_one(subject, layout, moved):
@@ -127,35 +121,6 @@ def test_what_a_person_before_has_told_is_begun_with(subject, layout, moved):
     assert np.linalg.norm(near.vertices(subject) - motion.vertices(subject), axis=2).max() < 1e-3
 
 
-def test_labels_are_found_some_frames_at_a_time(moved, monkeypatch):
-    _, _, positions, _ = moved
-    faulty = positions.copy()
-    exchanged(faulty, 3, 17, 0, 119)
-    faulty[90:, 5] = np.nan
-    monkeypatch.setattr(swaps, "AT_ONCE", 1000)
-    whole = find_order(faulty, RATE, positions, np.linspace(0.006, 0.01, FRAMES))
-    assert (whole[:120, [3, 17]] == [17, 3]).all() and (whole[120:] == np.arange(30)).all()
-    monkeypatch.setattr(swaps, "AT_ONCE", 7)
-    np.testing.assert_array_equal(find_order(faulty, RATE, positions, np.linspace(0.006, 0.01, FRAMES)), whole)
-
-
-def test_frames_are_smoothed_and_solved_some_at_a_time(subject, layout, moved, monkeypatch):
-    """A long sequence is never held whole: windows that overlap, and pieces of what is independent, tell the same."""
-    _, _, positions, _ = moved
-    body = MarkedBody(subject, layout, 1.0, 0.3)
-    config, weights = AnimateConfig(), np.full(positions.shape[:2], 1e4)
-    x = body.body.join(moved[0] + 0.02, moved[1])
-    arguments = x, config.inertia(RATE, body.n_unknowns), body.system, positions, weights
-    whole, alone = body.smooth_step(*arguments), body.solve(x, positions, weights, 5, 1e-6)
-    monkeypatch.setattr(smoothing, "WINDOW", 50)
-    monkeypatch.setattr(smoothing, "OVERLAP", 50)
-    monkeypatch.setattr(marked_body, "MOST", 50)
-    assert np.abs(body.smooth_step(*arguments) - whole).max() < 1e-6
-    pieces = body.solve(x, positions, weights, 5, 1e-6)
-    for one, other in ((pieces.x, alone.x), (pieces.energy, alone.energy), (pieces.converged, alone.converged)):
-        np.testing.assert_allclose(one, other, rtol=1e-9, atol=1e-12)
-
-
 def test_an_exchange_with_a_label_that_no_layout_knows(subject, layout, moved):
     _, _, positions, _ = moved
     few = layout.select(LABELS[:25])
@@ -180,22 +145,6 @@ def test_close_labels_are_tried_both_ways(subject, layout, moved):
     swapped = ambiguous_swap(body, x, Tracks(faulty, RATE), a, b)
     there = np.isfinite(faulty[:, a, 0])
     np.testing.assert_array_equal(swapped[there[swapped]], np.arange(55, 95))
-
-
-def test_what_a_marker_is_off_by_the_account_of_the_others(subject, layout, moved):
-    """The body that has gone after a displaced marker, corrected, is the one that never saw it."""
-    _, _, positions, _ = moved
-    faulty = positions[:40].copy()
-    faulty[:, 7] += [0.004, 0.01, -0.006]
-    body = Simulation(subject, MarkerSequence(faulty, LABELS, RATE), layout)
-    x = body.follow(faulty)
-    off = faulty - body.body.positions(x)
-    alone = body.alone(off, x, faulty)[:, 7]
-    without = faulty.copy()
-    without[:, 7] = np.nan
-    true = faulty[:, 7] - body.body.positions(body.follow(without))[:, 7]
-    assert np.linalg.norm(off[:, 7] - true, axis=1).mean() > 0.001
-    assert np.linalg.norm(alone - true, axis=1).mean() < 0.4 * np.linalg.norm(off[:, 7] - true, axis=1).mean()
 
 
 def test_bridges_join_both_ends_and_long_ones_pass_the_usual_place():

@@ -98,15 +98,6 @@ def test_markers_beside_their_usual_place_are_found_there():
     np.testing.assert_allclose(found.layout.distances, 0.0095, atol=4e-3)
 
 
-def test_the_body_does_not_shrink_towards_the_mean():
-    """Markers that may slide could take all of the shape upon themselves; they must not."""
-    mean, true = MODEL.vertices(REST, np.zeros(3)), MODEL.vertices(REST, BETAS)
-    found = MODEL.vertices(REST, beside().betas)
-    far = np.linalg.norm(true - mean, axis=1).mean()
-    assert np.linalg.norm(found - mean, axis=1).mean() > 0.9 * far
-    assert np.linalg.norm(found - true, axis=1).mean() < 0.25 * far
-
-
 @pytest.mark.slow
 def test_betas_are_as_long_as_the_markers_can_tell():
     """People who differ by a millimetre or two, in twelve ways, with markers 10 mm beside their place and 5 mm off the
@@ -179,42 +170,12 @@ def test_missing_and_wild_markers_change_little():
     assert np.nanmean(np.delete(found.residuals, 5, axis=1)) < 5e-3
 
 
-def test_loose_markers_are_looked_for_along_the_limb():
-    row, loose = 14, replace(LAYOUT, loose=("M14",))
-    rest = MODEL.template.with_vertices(SUBJECT.vertices(REST))
-    places = np.array(LAYOUT.place(rest))
-    on = Surface(rest).closest(places[row:row + 1] - [0.15, 0, 0])
-    places[row] = on.points[0] + 0.0095 * rest.face_normals[on.faces[0]]
-    apart = np.linalg.norm(places - rest_places(LAYOUT, BETAS), axis=1)[row]
-    found = find_person(MODEL, sequence(places), loose, USUAL)
-    assert apart > 0.1 and found.moved[row] > 0.8 * apart and found.layout.loose == ()
-    assert np.linalg.norm(rest_places(found.layout, found.betas) - places, axis=1)[row] < 0.02
-
-
 def test_frames_of_the_paper_are_drawn_at_random():
     _, positions = common_markers([sequence()], LAYOUT)
     first = choose_frames(positions, PersonConfig(published=True, frames=7))
     np.testing.assert_array_equal(first, choose_frames(positions, PersonConfig(published=True, frames=7)))
     assert len(set(first)) == 7 and (np.diff(first) > 0).all()
     assert not np.array_equal(first, choose_frames(positions, PersonConfig(frames=7)))
-
-
-@pytest.mark.parametrize(("settings", "message"), [
-    ({"frames": 0}, "frames: expected 1 to"),
-    ({"annealing": ()}, "annealing: expected at least one factor"),
-])
-def test_settings_that_make_no_sense(settings, message):
-    with pytest.raises(ValueError, match=message):
-        find_person(MODEL, sequence(), LAYOUT, PersonConfig(**settings))
-
-
-def test_what_cannot_be_used_is_named():
-    with pytest.raises(ValueError, match="sequences: expected at least one, got none"):
-        find_person(MODEL, [], LAYOUT)
-    with pytest.raises(ValueError, match="expected at least 3 markers of the layout, found 0"):
-        find_person(MODEL, MarkerSequence(np.zeros((2, 1, 3)), ("Q",), 60.0), LAYOUT)
-    with pytest.raises(ValueError, match="model: expected one with betas"):
-        find_person(worm_with_prior(components=0), sequence(), LAYOUT)
 
 
 def test_weights_of_the_paper_are_those_of_the_engine():

@@ -96,11 +96,6 @@ def test_what_is_no_recording_is_named(wrong, words):
         mosh(wrong)
 
 
-def test_the_order_of_old_calls_is_named():
-    with pytest.raises(ValueError, match=r"recordings: expected a file .*, got ScapeModel"):
-        mosh(small_people(), markers())
-
-
 def test_angles_are_a_table_with_names(monkeypatch, tmp_path):
     """Those of motion.mot: a dict, or with pandas a DataFrame of the same columns."""
     found = mosh(markers(), config=QUICKLY)

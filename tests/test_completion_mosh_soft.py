@@ -188,24 +188,6 @@ def test_the_movement_is_the_mean_of_a_gaussian_process() -> None:
         np.testing.assert_allclose(found[t], wanted, atol=1e-6)
 
 
-def test_windows_hardly_matter(monkeypatch) -> None:
-    model, where = body(), layout(body(), count=20)
-    markers, motion = seen(model, where)
-    whole = follow_soft_tissue(model, motion, markers, where)
-    monkeypatch.setattr(follow, "WINDOW", 20)
-    monkeypatch.setattr(follow, "OVERLAP", 10)
-    np.testing.assert_allclose(follow_soft_tissue(model, motion, markers, where).skin.moved, whole.skin.moved,
-                               rtol=0, atol=1e-6)
-
-
-def test_steadiness_holds_the_movement() -> None:
-    model, where = body(), layout(body())
-    markers, motion = seen(model, where, noise=0.005)
-    bend = [np.abs(np.diff(follow_soft_tissue(model, motion, markers, where, SoftTissueConfig(
-        temporal_smoothness=weight)).skin.moved, n=2, axis=0)).mean() for weight in (0.0, 1e4)]
-    assert bend[1] < 0.3 * bend[0]
-
-
 def test_the_world_may_be_turned() -> None:
     model, where = body(), layout(body(), 0.01)
     markers, motion = seen(model, where, noise=0.002)

@@ -38,18 +38,6 @@ def test_a_track_of_constant_acceleration_does_not_jump():
     assert not tracks.jumped.any() and np.flatnonzero(tracks.open[:, 0]).tolist() == [0, 30, 31, 32, 33, 34]
 
 
-def test_links_tell_which_label_goes_on():
-    positions = wavy()
-    exchanged(positions, 1, 4, 50, 119)
-    tracks = Tracks(positions, RATE)
-    some = np.arange(6)
-    cost = tracks.links(np.full((1, 1), 50), some[:, None], some)
-    assert cost.argmin(axis=1).tolist() == [0, 4, 2, 3, 1, 5] and (np.sort(cost, axis=1)[:, 1:] == TORN).all()
-    positions[45:50, 1] = np.nan                                     # over a gap: not as sure, but still the best
-    cost = Tracks(positions, RATE).links(np.array([50]), np.array([1]), np.array([4]))[0]
-    assert 0 < cost < TORN - 2
-
-
 def test_over_a_gap_a_track_may_have_been_accelerated():
     """Half squared deviations, and three times the logarithm by which they have grown: 2 mm a frame, 10 m/s² unseen."""
     positions = np.zeros((60, 1, 3))

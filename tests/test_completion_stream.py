@@ -365,23 +365,3 @@ def test_a_stream_does_not_begin_with_a_frame_that_no_body_makes(passing):
     frames = pushed(MarkerStream(subject, layout, layout.labels, 60.0, CONFIG), broken)
     assert all(np.isnan(f.pose).all() and not f.trusted.any() and not f.converged for f in frames[:3])
     assert errors(subject, frames[3:], truth[3:20]).max() < 0.01
-
-
-@pytest.mark.slow
-def test_a_body_far_from_every_frame_is_followed_in_the_end_and_trusts_none(passing):
-    subject, layout, _, positions = passing
-    frames = pushed(MarkerStream(subject, layout, layout.labels, 60.0, CONFIG), 1.5 * positions[:22])
-    assert not any(f.trusted.any() for f in frames)
-    assert np.isfinite([f.pose for f in frames[-5:]]).all()
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("wrong", ["times 1000", "half of it"])
-def test_one_frame_that_no_body_makes_leaves_the_others_of_a_sequence(passing, wrong):
-    subject, layout, truth, positions = passing
-    broken = positions.copy()
-    broken[33] = WRONG[wrong](positions[33])
-    motion = animate(subject, MarkerSequence(broken, layout.labels, 60.0), layout, CONFIG)
-    apart = np.linalg.norm(motion.vertices(subject) - truth, axis=2).mean(axis=1)
-    assert apart.max() < 0.015
-    assert motion.trusted[33].sum() < 30 and motion.trusted[np.arange(60) != 33].all()

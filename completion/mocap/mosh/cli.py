@@ -23,7 +23,7 @@ from ..files.markers import resolve_marker_unit
 from ..marker_sets.named import choose_layout
 from .call import MoshCall
 from .mosh import MoshConfig
-from .recordings import TABLE, Actor, subjects_table, write_grouping
+from .recordings import TABLE, subjects_table, write_grouping
 from .work import ERRORS, FIXED, MoshTask
 
 MarkersArg = Annotated[tuple[Path, ...], Place("MARKERS [MARKERS ...]")]
@@ -105,7 +105,7 @@ def carry_out(call: MoshCall, space: Workspace, workers: Workers, command: str, 
     # say who is who, for 20 people and 4 files of each
     for actor in actors[:20]:
         files, more = ", ".join(r.path.name for r in actor.recordings[:4]), len(actor.recordings) - 4
-        say(f"{actor.name}: {files}{f' and {more} more' if more > 0 else ''} ({actor.rule})")
+        say(f"{actor.name}: {files}{f' and {more} more' if more > 0 else ''}")
     if len(actors) > 20:
         say(f"and {len(actors) - 20} more people")
     # the work, then table, page and judgement
@@ -114,7 +114,7 @@ def carry_out(call: MoshCall, space: Workspace, workers: Workers, command: str, 
                       {name: line if line.startswith(f"{name}: ") else f"{name}: {line}"
                        for name, line in done.failures.items()}, done.fresh)
     lost = [f"{name}: {line}" for name, (_, failed) in done.values.items() for line in failed]
-    outcome = describe(call, loaded.name, actors).write(space, results, len(actors), lost)
+    outcome = describe(call, loaded.name).write(space, results, len(actors), lost)
     judged = [judgement_of(rows) for rows in results.values.values()]
     return replace(outcome, judgement=judged[0] if judged and len(actors) == 1 else outcome.judgement,
                    following=f"open {quote(str(space.folder / 'report.html'))}; "
@@ -122,13 +122,10 @@ def carry_out(call: MoshCall, space: Workspace, workers: Workers, command: str, 
                    "which also mends markers")
 
 
-def describe(call: MoshCall, model: str, actors: Sequence[Actor]) -> FolderCommand:
+def describe(call: MoshCall, model: str) -> FolderCommand:
     """Return the wording of table and page for the people of a call; `model` is its name."""
-    rules = {actor.name: actor.rule for actor in actors}
-
     def lines(name: str, rows: Sequence[Metric]) -> list[str]:
-        shown = [as_line(m) for m in rows if m.name in (JUDGEMENT, *ERRORS, "sequences", "frames", "sex")]
-        return [*shown, f"recordings put together: {rules[name]}"]
+        return [as_line(m) for m in rows if m.name in (JUDGEMENT, *ERRORS, "sequences", "frames", "sex")]
 
     return FolderCommand(
         ("person", "people"), "{} from markers", _summary, lambda rows: figure(rows, FIXED),

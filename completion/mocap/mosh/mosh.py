@@ -436,33 +436,11 @@ class _Stages:
             True)
 
 
-@dataclass(frozen=True, eq=False)
-class SexedMosh:
-    """Shape and motions of a person with the model of their sex.
-
-    Attributes
-    ----------
-    guess : SexGuess
-        The sex that the markers suggest.
-    model : BodyModel
-        The model of that sex.
-    neutral : PersonFit
-        The person with the neutral model, which gave the guess.
-    result : MoshResult
-        With the model of that sex; the motions have it as their gender.
-    """
-
-    guess: SexGuess
-    model: BodyModel
-    neutral: PersonFit
-    result: MoshResult
-
-
 @one_thread()
 def mosh_by_sex(models: Mapping[str, BodyModel], sequences: MarkerSequence | Sequence[MarkerSequence],
                 layout: MarkerLayout, config: MoshConfig | None = None, progress: Progress | None = None,
-                step: Step = run_uncached) -> SexedMosh:
-    """Run `mosh` with the model of the person's sex.
+                step: Step = run_uncached) -> tuple[SexGuess, MoshResult]:
+    """Run `mosh` with the model of the person's sex; return the guess, and the result, whose motions name the sex.
 
     The neutral model finds a body, its betas suggest the sex, and `mosh` runs with the model of that sex.
 
@@ -487,7 +465,7 @@ def mosh_by_sex(models: Mapping[str, BodyModel], sequences: MarkerSequence | Seq
     result = mosh(sequences, models[guess.sex], layout, config, progress, step)
     motions = tuple(replace(motion, gender=guess.sex) for motion in result.motions)
     soft = tuple(replace(one, motion=replace(one.motion, gender=guess.sex)) for one in result.soft_tissue)
-    return SexedMosh(guess, models[guess.sex], neutral, replace(result, motions=motions, soft_tissue=soft))
+    return guess, replace(result, motions=motions, soft_tissue=soft)
 
 
 def check_models(models: Mapping[str, BodyModel]) -> None:

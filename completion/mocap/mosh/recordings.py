@@ -3,7 +3,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 
 from scanprep.arguments import UsageError
@@ -28,11 +28,10 @@ class Recording:
 
 @dataclass(frozen=True)
 class Actor:
-    """A person: a name fit for a folder, its recordings, and the rule that grouped them."""
+    """A person: a name fit for a folder, and its recordings."""
 
     name: str
     recordings: tuple[Recording, ...]
-    rule: str = field(metadata={"digest": False})
 
 
 def subjects_table(subjects: str) -> Path | None:
@@ -66,7 +65,7 @@ def find_actors(markers: Iterable[Path], subjects: str = "auto", output: Path | 
                              f"({', '.join(sorted(prefixes)) or 'here: none'}), got '{prefix}'")
     if not files:
         raise ValueError(f"{', '.join(map(str, sources))}: expected files ending in {', '.join(READERS)}, found none")
-    # rows of person, file, prefix and rule: by the table, all together, or file by file
+    # rows of person, file and prefix: by the table, all together, or file by file
     if table is not None:
         subject_of = _read_table(table, [f.path for f in files])
         rows = []
@@ -74,21 +73,20 @@ def find_actors(markers: Iterable[Path], subjects: str = "auto", output: Path | 
             # in a file with several people, the one whom the table names
             named = (who for who in f.people if folder_name(who) == folder_name(subject))
             who = next(named, None) if len(f.people) > 1 else None
-            rows.append((folder_name(subject), f, who, f"as {table} says"))
+            rows.append((folder_name(subject), f, who))
     elif all(path.is_file() for path in sources) and not any(len(f.people) > 1 for f in files):
         name = folder_name(prefix or files[0].path.stem)
-        rows = [(name, f, prefix, "files that were named together") for f in files]
+        rows = [(name, f, prefix) for f in files]
     else:
-        rows = [(folder_name(name), f, who, rule) for f in files for name, who, rule in _people(f, prefix)]
-    return [Actor(person, _name_recordings(person, [(f, who) for name, f, who, _ in rows if name == person]),
-                  next(rule for name, *_, rule in rows if name == person))
+        rows = [(folder_name(name), f, who) for f in files for name, who in _people(f, prefix)]
+    return [Actor(person, _name_recordings(person, [(f, who) for name, f, who in rows if name == person]))
             for person in sorted({name for name, *_ in rows})]
 
 
 def write_grouping(path: Path, actors: Iterable[Actor]) -> None:
     """Write the people and their files as CSV, in the form that --subjects takes."""
-    tables.write_table(path, ("file", "subject", "rule"),
-                       ((r.path, actor.name, actor.rule) for actor in actors for r in actor.recordings))
+    tables.write_table(path, ("file", "subject"),
+                       ((r.path, actor.name) for actor in actors for r in actor.recordings))
 
 
 def folder_name(text: str) -> str:
@@ -129,15 +127,13 @@ def _files(sources: list[Path], output: Path | None, table: Path | None, prefix:
                 yield _File(path, parts[:-1], people)
 
 
-def _people(file: _File, prefix: str | None) -> Iterator[tuple[str, str | None, str]]:
-    """Yield name, prefix of labels and rule for the people in a file of a folder."""
+def _people(file: _File, prefix: str | None) -> Iterator[tuple[str, str | None]]:
+    """Yield name and prefix of labels for the people in a file of a folder."""
     if len(file.people) > 1:
         for who in file.people:
-            yield who, who, "by what stands before the labels"
-    elif file.folders:
-        yield file.folders[0], prefix, "by the sub-folder"
+            yield who, who
     else:
-        yield prefix or file.path.stem, prefix, "a file by itself"
+        yield file.folders[0] if file.folders else prefix or file.path.stem, prefix
 
 
 def _name_recordings(person: str, files: list[tuple[_File, str | None]]) -> tuple[Recording, ...]:

@@ -12,19 +12,9 @@ from model.linear import Subject
 from ...motion import Motion
 from ...motion_pictures import LightMesh
 from ..artefacts.results import MarkerArtefacts
-from ..files.force_plates import GroundReactions
 from ..files.markers import MarkerSequence
-from ..gait.cycles import GaitCycles
 from ..soft_tissue.soft_tissue import SoftTissue
 from .recordings import Recording
-
-
-@dataclass(frozen=True, eq=False)
-class Walk:
-    """What a gait laboratory reads of a sequence: gait cycles of somebody who walks, forces of force plates."""
-
-    gait: GaitCycles | None
-    reactions: GroundReactions | None
 
 
 @dataclass(frozen=True, eq=False)
