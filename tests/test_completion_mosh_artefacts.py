@@ -5,7 +5,7 @@ import pytest
 from completion_bodies import MEAN, worm_with_prior
 from marker_faults import FRAMES, LABELS, RATE, exchanged
 
-from completion.mocap.artefacts.find import Simulation, ambiguous_swap, bridge_gaps, find_artefacts
+from completion.mocap.artefacts.find import Simulation, ambiguous_swap, find_artefacts
 from completion.mocap.files.markers import MarkerSequence
 from completion.mocap.marker_sets.layout import MarkerLayout
 from completion.mocap.pose.follow import animate
@@ -145,17 +145,6 @@ def test_close_labels_are_tried_both_ways(subject, layout, moved):
     swapped = ambiguous_swap(body, x, Tracks(faulty, RATE), a, b)
     there = np.isfinite(faulty[:, a, 0])
     np.testing.assert_array_equal(swapped[there[swapped]], np.arange(55, 95))
-
-
-def test_bridges_join_both_ends_and_long_ones_pass_the_usual_place():
-    local = np.zeros((100, 1, 3))
-    local[:20], local[20:], local[90:] = 0.01, 0.03, 0.05
-    local[10:20] = local[40:90] = np.nan
-    out = bridge_gaps(local, 15.0)[:, 0, 0]
-    np.testing.assert_allclose(out[9:21], np.interp(np.arange(9, 21), [9, 20], [0.01, 0.03]), atol=1e-12)
-    usual = np.nanmedian(local[:, 0, 0])
-    np.testing.assert_allclose(out[54:75], usual, atol=1e-12)
-    assert np.abs(np.diff(out[38:92])).max() < 0.02 / 15 + 1e-9 and abs(out[89] - out[90]) > 1e-3
 
 
 def test_a_motion_of_other_length_is_refused(subject, layout, moved):

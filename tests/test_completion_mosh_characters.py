@@ -80,17 +80,6 @@ def test_it_reaches_the_ground_when_the_person_does(model, soft, character):
     np.testing.assert_allclose(ratio[high], np.median(ratio[high]), rtol=1e-6)
 
 
-def test_onto_oneself_it_is_the_same_motion(model, soft):
-    own = replace(soft, motion=replace(soft.motion, betas=np.zeros(3)))
-    moved = retarget_soft_tissue(own, model, model)
-    bodies = own.vertices(model)
-    np.testing.assert_array_equal(moved.changes, own.changes)
-    apart = moving_character(model, moved, np.arange(FRAMES))[1] - bodies
-    up, _ = world_up(soft.motion, model.subject(np.zeros(3)))
-    np.testing.assert_allclose(np.delete(apart, up, axis=2), 0, atol=1e-9)
-    np.testing.assert_allclose(apart - apart[:, :1], 0, atol=1e-9)         # up and down only, as a whole
-
-
 def test_refuses_a_character_of_fewer_betas(model, soft):
     small = replace(model, shape_space=model.shape_space.first(2))
     with pytest.raises(ValueError, match="the 3 betas that change, got 2"):

@@ -60,17 +60,6 @@ def test_everything_is_written(done):
             "exaggerated.glb", "character.glb", "character.npz"}
 
 
-def test_the_body_is_the_one_that_carried_the_markers(done, place):
-    model, truth = worm_with_prior(), np.load(place / "truth.npz")
-    for name in ("walk", "run"):
-        motion = Motion.load(done / "ann" / name / "motion.npz")
-        np.testing.assert_allclose(json.loads((done / "ann" / "subject.json").read_text())["betas"], motion.betas)
-        off = np.linalg.norm(motion.vertices(model.subject(motion.betas)) - truth[name], axis=2)
-        assert off.mean() < 0.02
-        soft = SoftTissue.load(done / "ann" / name / "soft_tissue.npz")
-        assert soft.changes.shape == (FRAMES, 3) and soft.motion.labels == motion.labels
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("words", [("--preset", "published"), ("--config", "soft.toml", "--character", "model.npz")])
 def test_betas_may_change_in_every_frame(place, tmp_path, monkeypatch, words):
@@ -179,14 +168,6 @@ def test_two_people_and_a_prop_in_one_file_become_two_folders(place, tmp_path, c
         assert np.linalg.norm(body - truth[take][some], axis=2).mean() < 0.03
 
 
-def test_a_recording_without_a_rate_asks_for_the_flag(place, tmp_path, capsys):
-    text = (place / "people" / "ann" / "walk.csv").read_text().splitlines()
-    rows = [f"{t}{line[line.index(','):]}" for t, line in enumerate(text[1:])]
-    (tmp_path / "walk.csv").write_text("\n".join(["frame" + text[0][4:], *rows]))
-    assert run(place, tmp_path / "walk.csv", "-o", tmp_path / "out") == 1
-    assert "expected the frames per second, it does not say them; say --rate" in capsys.readouterr().err
-
-
 def names(actors):
     return {actor.name: [r.name for r in actor.recordings] for actor in actors}
 
@@ -236,14 +217,6 @@ def test_a_table_says_who_is_who(tmp_path, ending):
             csv.writer(out).writerows([("file", "subject"), *said.items()])
     found = find_actors([tmp_path / "in"], str(table))
     assert names(found) == {"u": ["2", "x_1"], "v": ["y_1"]}
-
-
-@pytest.mark.parametrize("count, rate, step", [(1, 120, 4), (500, 25, 1), (494, 60, 2), (2751, 120, 4),
-                                               (10**5, 120, 50), (10**5 + 1, 25, 51)])
-def test_a_page_plays_no_more_frames_than_it_can_carry(count, rate, step):
-    motion = Motion(np.zeros((count, 1, 3)), np.zeros((count, 3)), None, rate, np.zeros((count, 0)))
-    frames, shown = frames_to_play(motion)
-    assert frames[1:2].tolist() == [step][:count - 1] and shown == rate / step and len(frames) <= 2000
 
 
 @pytest.mark.slow

@@ -19,7 +19,6 @@ from completion.mocap.soft_tissue.soft_tissue import (
     SoftTissue,
     changing_bodies,
     in_root,
-    in_world,
     skin_movement,
     smooth_modes,
 )
@@ -87,15 +86,6 @@ def soft_of(model: BodyModel) -> SoftTissue:
     modes, _ = smooth_modes(model.template, np.array([20, 120, 220, 320]), 0.2)
     moved = SIZE * np.sin(np.arange(T * 12).reshape(T, 4, 3))
     return SoftTissue(fixed(poses, trans, layout(model)), np.zeros((T, 3)), SkinMovement(modes, moved))
-
-
-@pytest.mark.parametrize("kind", KINDS)
-def test_bodies_together_are_those_one_by_one(kind: str) -> None:
-    model = body(kind)
-    poses, trans = moving(model)
-    betas = OWN + 0.5 * np.sin(np.arange(3 * T)).reshape(T, 3)
-    one_by_one = np.array([model.vertices(*each) for each in zip(poses, betas, trans, strict=True)])
-    np.testing.assert_allclose(changing_bodies(model, poses, betas, trans), one_by_one, rtol=0, atol=1e-12)
 
 
 @pytest.mark.parametrize("config", [SoftTissueConfig(), SoftTissueConfig(reach=0.15)])
@@ -201,38 +191,6 @@ def test_the_world_may_be_turned() -> None:
     other = follow_soft_tissue(model, elsewhere, turned, where)
     np.testing.assert_allclose(other.skin.moved, one.skin.moved, rtol=0, atol=1e-4)
     np.testing.assert_allclose(other.vertices(model), one.vertices(model) @ R.T + shift, rtol=0, atol=1e-4)
-
-
-def test_the_axes_of_the_root_and_back() -> None:
-    poses, _ = moving(body())
-    moved = np.random.default_rng(0).normal(size=(T, 5, 3))
-    np.testing.assert_allclose(in_root(in_world(moved, poses), poses), moved, atol=1e-12)
-
-
-def test_markers_that_are_missing_or_not_trusted_count_nothing() -> None:
-    model, where = body(), layout(body())
-    markers, motion = seen(model, where)
-    gone, wrong = markers.positions.copy(), markers.positions.copy()
-    gone[5:9, 3], wrong[5:9, 3] = np.nan, wrong[5:9, 3] + 0.05
-    trusted = motion.trusted.copy()
-    trusted[5:9, 3] = False
-    one = follow_soft_tissue(model, motion, replace(markers, positions=gone), where)
-    other = follow_soft_tissue(model, replace(motion, trusted=trusted), replace(markers, positions=wrong), where)
-    np.testing.assert_allclose(other.skin.moved, one.skin.moved, rtol=0, atol=1e-3)
-    assert np.isnan(one.motion.residuals[5:9, 3]).all()
-    np.testing.assert_allclose(other.motion.residuals[5:9, 3], np.sqrt(3) * 0.05, rtol=0, atol=0.02)
-
-
-@pytest.mark.parametrize("count", [1, 2, 3])
-def test_few_frames_and_frames_without_markers(count: int) -> None:
-    model, where = body(), layout(body())
-    markers, motion = seen(model, where)
-    few = Motion(motion.poses[:count], motion.trans[:count], OWN, RATE, motion.residuals[:count], motion.labels)
-    found = follow_soft_tissue(model, few, markers.frames(slice(0, count)), where)
-    assert found.skin.moved.shape == (count, 80, 3) and np.abs(found.skin.moved).max() > 0.001
-    blind = replace(markers.frames(slice(0, count)), positions=np.full((count, 80, 3), np.nan))
-    found = follow_soft_tissue(model, few, blind, where)
-    assert not found.skin.moved.any() and np.array_equal(found.motion.poses, few.poses)
 
 
 def changing(model: BodyModel, where: MarkerLayout, changes: np.ndarray) -> tuple[MarkerSequence, Motion]:

@@ -1,5 +1,4 @@
 """Exchanges, slips and noise of tracks of markers, without a body."""
-import itertools
 
 import numpy as np
 import pytest
@@ -7,7 +6,7 @@ from marker_faults import FRAMES, LABELS, RATE, exchanged
 
 from completion.mocap.artefacts.results import BadSpan, list_swaps
 from completion.mocap.artefacts.slips import find_bad, without_lost_limbs
-from completion.mocap.pose.swaps import AWAY, TORN, Tracks, _two_states, find_order, marker_levels
+from completion.mocap.pose.swaps import AWAY, TORN, Tracks, find_order, marker_levels
 from scanprep.geometry import rotations
 
 
@@ -109,20 +108,6 @@ def test_what_flickers_or_is_gone_is_not_exchanged():
     positions[80:90, 3] += 0.3
     positions[20:60, 5] = np.nan
     assert (tracked(positions) == np.arange(6)).all()
-
-
-def test_two_states_are_the_best_of_all_ways():
-    rng = np.random.default_rng(1)
-    for _ in range(30):
-        gains, stay, switch = rng.normal(0, 5, 6), rng.uniform(0, 10, 5), rng.uniform(0, 10, 5)
-
-        def worth(way, gains=gains, stay=stay, switch=switch):
-            change = np.diff(way) != 0
-            return gains[np.array(way, bool)].sum() - np.where(change, switch + 4.0, stay).sum() + stay.sum()
-
-        best = max(itertools.product((0, 1), repeat=6), key=worth)
-        total, swapped = _two_states(gains, stay, switch)
-        assert total == pytest.approx(worth(best)) and swapped.astype(int).tolist() == list(best)
 
 
 # ---- bad spans

@@ -86,15 +86,6 @@ def test_markers_are_clicked_beside_the_landmarks_and_saved_as_a_layout(worn, tm
     app.close()
 
 
-def test_a_marker_set_brings_its_labels(worn, tmp_path):
-    app = app_of(worn, tmp_path)
-    sent(app, "choose", name="cmu41")
-    assert len(app.names) == len(NAMES) + 41 and app.chosen in app.names and "cmu41" not in app.names
-    sent(app, "choose", name="my own")
-    assert app.names[-1] == app.chosen == "my own"
-    app.close()
-
-
 def test_the_command_does_the_same(worn, tmp_path):
     model, body, markers, _ = worn
     model.save(tmp_path / "model.npz")
