@@ -1,5 +1,4 @@
 import copy
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -15,7 +14,6 @@ from completion.mocap.pose.marked_body import MarkedBody, marker_weights
 from completion.mocap.pose.part_shapes import PartShapes
 from completion.mocap.pose.stream import KalmanPrediction, MarkerStream
 from completion.mocap.pose.swaps import LabelWatch
-from completion.motion import Motion
 from model.features import linear_features
 from model.pose_space import PoseSpace
 from model.scape import ScapeModel
@@ -297,17 +295,6 @@ def test_what_stands_is_held_on_the_floor_and_the_rest_is_free(walker):
     assert held.all(axis=0).sum() >= 4 and (feet.floor.above(places[held]) > -1e-9).all()
     x[40:, -1] += 1                                                  # as if standing in the air
     assert np.isnan(FootContact(body, x, 60.0).target_positions(x)[45:]).all()
-
-
-def test_a_motion_keeps_which_markers_were_trusted(tmp_path):
-    residuals = np.array([[0.01, np.nan], [0.2, 0.01]])
-    motion = Motion(np.zeros((2, 1, 3)), np.zeros((2, 3)), None, 60.0, residuals, ("A", "B"))
-    np.testing.assert_array_equal(motion.trusted, [[True, False], [True, True]])
-    doubted = replace(motion, trusted=np.array([[True, False], [False, True]]))
-    doubted.save(tmp_path / "m.npz")
-    np.testing.assert_array_equal(Motion.load(tmp_path / "m.npz").trusted, doubted.trusted)
-    with pytest.raises(ValueError, match="trusted: expected shape"):
-        replace(motion, trusted=np.ones((2, 3), dtype=bool))
 
 
 @pytest.fixture(scope="module")

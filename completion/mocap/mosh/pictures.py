@@ -10,8 +10,8 @@ from model.body import BodyModel
 from scanprep.cli import MM
 from scanprep.geometry.mesh import Mesh
 from scanprep.pictures.camera import look_around, stance
-from scanprep.pictures.scene import Pane, picture_pane, picture_panes
-from scanprep.pictures.shading import Bones, Dots, Heat, Shape, Solid, contact_sheet
+from scanprep.pictures.scene import Pane, picture_panes
+from scanprep.pictures.shading import Bones, Dots, Heat, Shape, Solid
 
 from ...motion_pictures import (
     MARKER,
@@ -58,11 +58,6 @@ def kinds_of_markers(take: Take) -> dict[str, tuple[Sequence[float], np.ndarray]
     return {name: (color, at) for name, (color, at) in found.items() if np.isfinite(at).any()}
 
 
-def take_marker_dots(take: Take, t: int, radius: float = 0.014) -> list[Dots]:
-    """Return the measured markers of a frame as dots: trusted and distrusted ones."""
-    return [Dots(at[t], color, radius, name=name) for name, (color, at) in kinds_of_markers(take).items()]
-
-
 def take_pane(take: Take) -> Pane:
     """Return the whole sequence with its markers."""
     frames, _ = frames_to_play(take.shown)
@@ -71,22 +66,15 @@ def take_pane(take: Take) -> Pane:
     return moving_pane(take.shown, take.subject, dots, take.make, take.light)
 
 
-def take_frame_panes(take: Take, frames: np.ndarray, looks: Sequence[Sequence[Shape]] | None = None,
-                     radius: float = 0.014) -> list[Pane]:
-    """Return some frames with their markers; `looks` replaces the plain body in each."""
-    vertical, bodies = upwards(take.shown, take.subject), take.bodies(frames)
-    looks = looks or [[take.light.mesh(body)] for body in bodies]
-    return [Pane([*look, *take_marker_dots(take, int(t), radius)],
-                 facing(take.subject, take.shown.poses[t], body, vertical=vertical),
-                 f"{t} · {t / take.shown.rate:.2f} s")
-            for t, body, look in zip(frames, bodies, looks, strict=True)]
-
-
-def picture_large(take: Take, frames: np.ndarray, height: int = 340) -> np.ndarray:
-    """Render some frames in a row."""
-    panes = take_frame_panes(take, frames)
-    return contact_sheet([picture_pane(pane, round(0.62 * height), height) for pane in panes],
-                         [pane.label for pane in panes])
+def take_frame_panes(take: Take, frames: np.ndarray) -> list[Pane]:
+    """Return some frames with their markers."""
+    vertical, panes = upwards(take.shown, take.subject), []
+    for t, body in zip(frames.tolist(), take.bodies(frames), strict=True):
+        dots = [Dots(at[t], color, 0.014, name=name) for name, (color, at) in kinds_of_markers(take).items()]
+        panes.append(Pane([take.light.mesh(body), *dots],
+                          facing(take.subject, take.shown.poses[t], body, vertical=vertical),
+                          f"{t} · {t / take.shown.rate:.2f} s"))
+    return panes
 
 
 def soft_pane(take: Take, frames: np.ndarray) -> Pane:

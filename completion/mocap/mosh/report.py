@@ -11,6 +11,8 @@ from scanprep.console import Metric
 from scanprep.folders import add_entry, as_line
 from scanprep.geometry.farthest_points import spread_indices
 from scanprep.pictures.page import Page
+from scanprep.pictures.scene import picture_pane
+from scanprep.pictures.shading import contact_sheet
 from scanprep.pictures.sheets import webp_bytes
 
 from ...motion_pictures import marker_rows, mean_over, worst_frames
@@ -143,7 +145,8 @@ def person_picture(model: BodyModel, result: MoshResult) -> np.ndarray:
 def take_picture(take: Take) -> np.ndarray:
     """Render six frames of a sequence, for the page of its person."""
     frames = np.unique(np.linspace(0, len(take.motion.poses) - 1, 8).round().astype(int)[1:-1])
-    return pictures.picture_large(take, frames, 260)
+    panes = pictures.take_frame_panes(take, frames)
+    return contact_sheet([picture_pane(pane, 161, 260) for pane in panes], [pane.label for pane in panes])
 
 
 def _main(metrics: Sequence[Metric]) -> list[Metric]:
