@@ -1,9 +1,6 @@
-"""Folders of tiny recordings for `scape mosh`; as a program it does one and is killed: PLACE STAGE CALL WORDS."""
+"""Folders of tiny recordings for `scape mosh`; as a program it does one: PLACE WORDS."""
 import hashlib
-import importlib
 import json
-import os
-import signal
 import sys
 from contextlib import contextmanager
 from pathlib import Path
@@ -26,13 +23,6 @@ FRAMES = 40
 BETAS = {"ann": np.array([0.9, -0.6, 0.4]), "bob": np.array([-0.8, 0.5, -0.3])}
 TAKES = (("ann", "walk", 0.0), ("ann", "run", 1.0), ("bob", "jump", 0.5))
 QUICK = {"frames": 4, "annealing": [4.0, 1.0]}
-STAGES = {"start": "completion.mocap.subject.person.start_frames",
-          "solve": "completion.mocap.subject.person.LatentFit.solve",
-          "poses": "completion.mocap.mosh.mosh.animate",
-          "artefacts": "completion.mocap.mosh.mosh.find_artefacts",
-          "soft": "completion.mocap.mosh.mosh.follow_soft_tissue",
-          "files": "completion.mocap.mosh.work.write_take", "page": "completion.mocap.mosh.work.take_page",
-          "person page": "completion.mocap.mosh.work.person_page"}
 TIMES = ("s", "frames/s")            # units of figures that differ between two runs
 
 
@@ -82,7 +72,7 @@ class QuietWork(MoshTask):
 
     def __call__(self, actor, room):
         with small_pictures(), pytest.MonkeyPatch.context() as patch:
-            for chart in ("chart_frames", "chart_map", "chart_timeline"):
+            for chart in ("chart_frames", "chart_timeline"):
                 patch.setattr(report, chart, lambda take: None)
             patch.setattr(Page, "chart", lambda page, *_rest: page)
             return super().__call__(actor, room)
@@ -101,47 +91,6 @@ def contents(output):
     return found
 
 
-@contextmanager
-def counted(before=lambda stage, call: None):
-    """How often each stage is called; `before` is called with its name and which call it is."""
-    calls = dict.fromkeys(STAGES, 0)
-    with pytest.MonkeyPatch.context() as patch:
-        for stage, target in STAGES.items():
-            patch.setattr(target, _telling(stage, _found(target), calls, before))
-        yield calls
-
-
-def _telling(stage, function, calls, before):
-    def told(*given, **named):
-        calls[stage] += 1
-        before(stage, calls[stage])
-        return function(*given, **named)
-
-    return told
-
-
-def _found(target):
-    parts = target.split(".")
-    for k in range(len(parts), 0, -1):
-        try:
-            found = importlib.import_module(".".join(parts[:k]))
-            break
-        except ModuleNotFoundError:
-            continue
-    for part in parts[k:]:
-        found = getattr(found, part)
-    return found
-
-
-def _killed(place, stage, call, *words):
-    def kill(now, number):
-        if (now, number) == (stage, int(call)):
-            os.kill(os.getpid(), signal.SIGKILL)
-
-    cli.MoshTask = QuietWork
-    with counted(kill):
-        sys.exit(run(Path(place), *words))
-
-
 if __name__ == "__main__":
-    _killed(*sys.argv[1:])
+    cli.MoshTask = QuietWork
+    sys.exit(run(Path(sys.argv[1]), *sys.argv[2:]))

@@ -77,20 +77,6 @@ def test_a_person_and_the_motion_from_markers(place, tmp_path):
     assert "On another person" in page and "With a body that changes" in page and ">M29<" in page
 
 
-def test_the_glb_shows_every_frame_at_its_time(place, tmp_path):
-    assert run(place, place / "walk.csv", "-o", tmp_path / "out", "--subject", "template") == 0
-    motion = Motion.load(tmp_path / "out" / "motion.npz")
-    glb, body = Glb((tmp_path / "out" / "animation.glb").read_bytes()), worm_with_prior().subject(None)
-    for sampler in glb.json["animations"][0]["samplers"]:
-        assert np.allclose(glb.array(sampler["input"])[:, 0], np.arange(FRAMES) / 60)
-    shown = np.stack([glb.skinned(t) for t in range(FRAMES)]) @ turn_up(guess_upright(body.template)[0])
-    off = 1000 * np.linalg.norm(shown - motion.vertices(body), axis=2)
-    figures = told(tmp_path / "out")
-    assert figures["animation.glb, distance from the exact body, mean"] == pytest.approx(off.mean(), rel=1e-3)
-    assert off.mean() < 1 and figures["the same, largest"] == pytest.approx(off.max(), rel=1e-3)
-    assert motion.betas is None
-
-
 @pytest.mark.parametrize("changing", [False, True])
 def test_a_long_motion_is_shown_at_its_own_times(tmp_path, changing, monkeypatch):
     """Of 53 frames the bodies of 20 are asked for: 2.7 frames apart, which even times would shift by half of one."""

@@ -8,7 +8,7 @@ from scipy.linalg import block_diag
 from completion.mocap.files.markers import MarkerSequence
 from completion.mocap.marker_sets.layout import MarkerLayout
 from completion.mocap.pose.follow import AnimateConfig, animate
-from completion.mocap.pose.marked_body import MarkedBody, marker_weights, supports
+from completion.mocap.pose.marked_body import MarkedBody, marker_weights
 from completion.motion import Motion
 from model.fitting import energy
 from scanprep.geometry import rotations
@@ -16,7 +16,7 @@ from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.storage import StorageError
 
 FRAMES = 60
-PLAIN = AnimateConfig(smoothing=0)
+PLAIN = AnimateConfig()
 
 
 @pytest.fixture(scope="module")
@@ -68,13 +68,12 @@ def test_the_motion_comes_back_from_its_markers(subject, layout, walk):
 
 
 def test_a_frame_has_converged_where_the_last_round_left_it(subject, layout, walk):
-    """From 5 cm beside the motion one round moves all frames; from its end no round moves any."""
+    """From far beside the motion the last round still moves frames; from its end it moves none."""
     _, sequence = walk
-    found = animate(subject, sequence, layout, AnimateConfig(smoothing=6))
-    beside = replace(found, trans=found.trans + [0.05, 0, 0])
-    once = AnimateConfig(smoothing=1)
-    assert not animate(subject, sequence, layout, once, near=beside).converged.any()
-    assert animate(subject, sequence, layout, once, near=found).converged.all()
+    found = animate(subject, sequence, layout, near=animate(subject, sequence, layout))
+    beside = replace(found, poses=found.poses + [0, 1.2, 0])
+    assert not animate(subject, sequence, layout, near=beside).converged.all()
+    assert animate(subject, sequence, layout, near=found).converged.all()
 
 
 def test_a_body_ten_times_as_large_settles_as_well(subject, layout, walk):
@@ -82,12 +81,11 @@ def test_a_body_ten_times_as_large_settles_as_well(subject, layout, walk):
     model, (_, sequence) = worm_with_prior(), walk
     skeleton = replace(model.skeleton, joints=10 * model.skeleton.joints)
     large = replace(model, template=Mesh(10 * model.template.vertices, model.template.faces), skeleton=skeleton)
-    wide = AnimateConfig(smoothing=2, marker_sd=0.1, outlier=0.6, place_acceleration=150)
-    found = animate(subject, sequence, layout, AnimateConfig(smoothing=6))
+    found = animate(subject, sequence, layout, near=animate(subject, sequence, layout))
     beside = replace(found, poses=found.poses + 0.15 * np.sin(np.arange(FRAMES))[:, None, None] ** 8)
-    once = animate(subject, sequence, layout, AnimateConfig(smoothing=2), near=beside)
+    once = animate(subject, sequence, layout, near=beside)
     again = animate(large.subject(np.array([0.5, -0.5, 0.2])), changed(sequence, 10 * sequence.positions),
-                    MarkerLayout(layout.labels, layout.vertices, 0.12), wide,
+                    MarkerLayout(layout.labels, layout.vertices, 0.12), AnimateConfig(marker_sd=0.1, outlier=0.6),
                     near=replace(beside, trans=10 * beside.trans))
     assert once.converged.all() and again.converged.all()
     np.testing.assert_allclose(again.poses, once.poses, atol=0.01)
@@ -108,21 +106,11 @@ def test_missing_markers_are_left_out(subject, layout, walk):
     assert np.isfinite(motion.poses).all() and not motion.converged[:3].any()
 
 
-def test_a_swapped_and_a_stray_marker_do_not_pull(subject, layout, walk):
-    meshes, sequence = walk
-    positions = sequence.positions.copy()
-    positions[20:40, [3, 9]] = positions[20:40, [9, 3]]
-    positions[10:, 5] += [0.4, 0.3, -0.5]
-    motion = animate(subject, changed(sequence, positions), layout, PLAIN)
-    assert surface_error(subject, motion, meshes).max() < 0.015
-    assert motion.residuals[20:, 5].min() > 0.3
-
-
 def test_smoothing_takes_noise_away(subject, layout, walk):
     meshes, sequence = walk
     noisy = changed(sequence, sequence.positions + np.random.default_rng(1).normal(0, 0.01, (FRAMES, 30, 3)))
-    rough = animate(subject, noisy, layout, PLAIN)
-    smooth = animate(subject, noisy, layout, AnimateConfig(smoothing=2))
+    rough = animate(subject, noisy, layout, AnimateConfig(angle_acceleration=1e5, published=True))
+    smooth = animate(subject, noisy, layout)
     assert surface_error(subject, smooth, meshes).mean() < 0.9 * surface_error(subject, rough, meshes).mean()
 
     def jerk(motion):
@@ -134,11 +122,6 @@ def test_smoothing_takes_noise_away(subject, layout, walk):
 @pytest.fixture(scope="module")
 def body(subject, layout):
     return MarkedBody(subject, layout, PLAIN.prior_weight, PLAIN.prior_shrinkage)
-
-
-def smooth_step(body, x, targets):
-    weights, _ = marker_weights(body.positions(x), targets, PLAIN.marker_sd, PLAIN.outlier)
-    return body.smooth_step(x, PLAIN.inertia(100.0, 15), body.system, targets, weights)
 
 
 def test_one_smoothing_step_is_the_dense_gauss_newton_step(body, walk):
@@ -166,25 +149,6 @@ def test_one_smoothing_step_is_the_dense_gauss_newton_step(body, walk):
     np.testing.assert_allclose(got[:, -3:] - x[:, -3:], step[:, -3:], atol=1e-5)
 
 
-def test_windows_agree_with_the_whole(body, walk, monkeypatch):
-    x = np.random.default_rng(0).normal(0, 0.02, (FRAMES, 15))
-    whole = smooth_step(body, x, walk[1].positions)
-    monkeypatch.setattr("completion.smoothing.WINDOW", 20)
-    monkeypatch.setattr("completion.smoothing.OVERLAP", 15)
-    assert np.abs(smooth_step(body, x, walk[1].positions) - whole).max() < 0.02 * np.abs(whole - x).max()
-
-
-def test_markers_sit_where_the_layout_places_them(subject, layout, body):
-    rest = np.zeros(15)
-    template = subject.template.with_vertices(subject.vertices(np.zeros((4, 3)), np.zeros(3)))
-    assert np.linalg.norm(body.positions(rest) - layout.place(template), axis=1).max() < 0.004   # two ways to a normal
-    flat = MarkerLayout(layout.labels, layout.vertices, 0.0)
-    np.testing.assert_allclose(MarkedBody(subject, flat, 0.3, 0.3).positions(rest), flat.place(template), atol=1e-12)
-    ids, weights = supports(subject.template, layout)
-    np.testing.assert_allclose(weights.sum(axis=1), 1)
-    assert len(ids) == 3 * len(layout.labels)
-
-
 def test_a_layout_that_shares_too_few_labels_is_refused(subject, layout, walk):
     sequence = MarkerSequence(walk[1].positions[:, :5], ("M0", "M1", "X", "Y", "Z"), 100.0)
     with pytest.raises(ValueError, match="expected at least 3 markers of the layout, found 2"):
@@ -203,13 +167,13 @@ def motion():
     residuals = rng.random((6, 2))
     residuals[1, 1] = np.nan
     return Motion(rng.normal(size=(6, 4, 3)), rng.normal(size=(6, 3)), np.array([0.1, -2]), 120.0, residuals,
-                  ("LSHO", "RSHO"), "male", np.arange(6) > 0)
+                  ("LSHO", "RSHO"), "male", np.arange(6) > 0, residuals > 0.5)
 
 
 def test_a_motion_is_read_as_it_was_written(motion, tmp_path):
     motion.save(tmp_path / "walk.npz")
     back = Motion.load(tmp_path / "walk.npz")
-    for name in ("poses", "trans", "betas", "residuals", "converged"):
+    for name in ("poses", "trans", "betas", "residuals", "converged", "trusted"):
         np.testing.assert_array_equal(getattr(back, name), getattr(motion, name))
     assert (back.rate, back.labels, back.gender) == (120.0, ("LSHO", "RSHO"), "male")
     with np.load(tmp_path / "walk.npz", allow_pickle=False) as data:
@@ -235,11 +199,3 @@ def test_files_that_are_no_motion_are_refused(tmp_path, content, message):
     np.savez(tmp_path / "m.npz", **content)
     with pytest.raises(StorageError, match=message):
         Motion.load(tmp_path / "m.npz")
-
-
-def test_missing_and_damaged_files_are_refused(tmp_path):
-    with pytest.raises(StorageError, match="no such file"):
-        Motion.load(tmp_path / "none.npz")
-    (tmp_path / "text.npz").write_text("nothing of the kind")
-    with pytest.raises(StorageError, match="expected a motion"):
-        Motion.load(tmp_path / "text.npz")

@@ -353,8 +353,6 @@ WRONG = {
     "label gone.c3d -o out.c3d --layout layout.json -m model.npz": (1, "gone.c3d"),
     "animate raw.c3d -o out -m model.npz --unlabelled": (2, "--unlabelled: expected --layout"),
     "animate walk.bvh -o out -m model.npz --unlabelled": (1, "a motion has no markers; leave out"),
-    "animate raw.c3d -o out -m model.npz --layout layout.json --unlabelled --subject-prefix Ann":
-        (2, "--unlabelled: markers without names have no --subject-prefix"),
     "mosh raw.c3d -o out -m model.npz --unlabelled": (2, "--unlabelled: expected --layout")}
 
 

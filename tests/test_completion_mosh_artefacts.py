@@ -3,18 +3,13 @@
 import numpy as np
 import pytest
 from completion_bodies import MEAN, worm_with_prior
-from marker_faults import CONFIG, FRAMES, LABELS, RATE, exchanged
+from marker_faults import FRAMES, LABELS, RATE, exchanged
 
-from completion import smoothing
-from completion.mocap.artefacts import find
-from completion.mocap.artefacts.find import Simulation, ambiguous_swap, bridge_gaps, find_artefacts
+from completion.mocap.artefacts.find import Simulation, ambiguous_swap, find_artefacts
 from completion.mocap.files.markers import MarkerSequence
 from completion.mocap.marker_sets.layout import MarkerLayout
-from completion.mocap.mosh.pictures import chart_artefacts
-from completion.mocap.pose import follow, marked_body, swaps
-from completion.mocap.pose.follow import AnimateConfig, animate
-from completion.mocap.pose.marked_body import MarkedBody
-from completion.mocap.pose.swaps import Tracks, find_order
+from completion.mocap.pose.follow import animate
+from completion.mocap.pose.swaps import Tracks
 
 
 @pytest.fixture(scope="module")
@@ -56,7 +51,7 @@ def neighbours(positions):
 def test_a_clean_sequence_has_no_faults(subject, layout, moved):
     _, _, positions, _ = moved
     ticks = []
-    found = find_artefacts(subject, changed(positions), layout, CONFIG, progress=lambda *at: ticks.append(at))
+    found = find_artefacts(subject, changed(positions), layout, progress=lambda *at: ticks.append(at))
     assert found.swaps == () and found.bad == () and len(ticks) == 1
     np.testing.assert_array_equal(found.repaired.positions, positions)
     assert np.linalg.norm(found.simulated - positions, axis=2).max() < 0.008 and found.weights.min() > 0.9
@@ -74,7 +69,7 @@ def test_faults_of_all_kinds_together(subject, layout, moved):
     faulty[40:100, noisy] += np.random.default_rng(2).normal(0, 0.01, (60, 3))
     faulty[90:120, stray] += [0.2, -0.1, 0.1]
     faulty[30:60, gone] = np.nan
-    found = find_artefacts(subject, changed(faulty), layout, CONFIG)
+    found = find_artefacts(subject, changed(faulty), layout)
     assert {(frozenset((e.first, e.second)), e.begin, e.end) for e in found.swaps} == {
         (frozenset((LABELS[a], LABELS[b])), 20, 79), (frozenset((LABELS[a], LABELS[far])), 100, 140)}
     spans = {s.label: s for s in found.bad}
@@ -89,8 +84,6 @@ def test_faults_of_all_kinds_together(subject, layout, moved):
     filled = found.virtual()
     assert filled.seen.all() and np.linalg.norm(filled.positions - positions, axis=2).max() < 0.012
     assert found.weights[60:, slipped].max() == 0 and found.weights[:60, slipped].min() > 0.5
-    titles = [axis.get_ylabel() for axis in chart_artefacts(found, changed(faulty)).axes]
-    assert sorted(titles) == sorted({*spans, LABELS[a], LABELS[b], LABELS[far]})
 
 
 def test_the_motion_of_repaired_markers_is_the_clean_one(subject, layout, moved):
@@ -101,64 +94,31 @@ def test_the_motion_of_repaired_markers_is_the_clean_one(subject, layout, moved)
         begin = int(rng.integers(0, 100))
         exchanged(faulty, a, b, begin, begin + int(rng.integers(20, 50)))
     meshes = subject.vertices(poses, trans)
-    found = find_artefacts(subject, changed(faulty), layout, CONFIG)
+    found = find_artefacts(subject, changed(faulty), layout)
     assert len(found.swaps) == 6
 
     def error(sequence):
-        motion = animate(subject, sequence, layout, AnimateConfig())
+        motion = animate(subject, sequence, layout)
         return np.linalg.norm(motion.vertices(subject) - meshes, axis=2).mean()
 
     assert error(found.repaired) < 1.05 * error(changed(positions))
-    given = find_artefacts(subject, changed(positions), layout, CONFIG, animate(subject, changed(positions), layout,
-                                                                             AnimateConfig()))
+    given = find_artefacts(subject, changed(positions), layout, animate(subject, changed(positions), layout))
     assert given.swaps == () and given.bad == ()
 
 
-def test_what_a_person_before_has_told_is_begun_with(subject, layout, moved, monkeypatch):
-    """The same is found, and no key frame is followed for it."""
+def test_what_a_person_before_has_told_is_begun_with(subject, layout, moved):
     _, _, positions, turns = moved
     faulty = positions.copy()
     exchanged(faulty, *neighbours(positions)[:2], 40, 99)
     faulty[60:, 20] += turns[60:, 20] @ [0.03, 0, 0]
-    first = find_artefacts(subject, changed(faulty), layout, CONFIG)
-    motion = animate(subject, first.repaired, layout, AnimateConfig())
-    monkeypatch.setattr(find, "between_keys", None)
-    monkeypatch.setattr(follow, "between_keys", None)
-    again = find_artefacts(subject, changed(faulty), layout, CONFIG, motion, known=first)
+    first = find_artefacts(subject, changed(faulty), layout)
+    motion = animate(subject, first.repaired, layout)
+    again = find_artefacts(subject, changed(faulty), layout, motion, known=first)
     assert [vars(e) for e in again.swaps] == [vars(e) for e in first.swaps]
     assert [(b.label, b.kind, b.begin) for b in again.bad] == [(b.label, b.kind, b.begin) for b in first.bad]
     np.testing.assert_array_equal(again.repaired.positions, first.repaired.positions)
-    near = animate(subject, first.repaired, layout, AnimateConfig(), near=motion)
+    near = animate(subject, first.repaired, layout, near=motion)
     assert np.linalg.norm(near.vertices(subject) - motion.vertices(subject), axis=2).max() < 1e-3
-
-
-def test_labels_are_found_some_frames_at_a_time(moved, monkeypatch):
-    _, _, positions, _ = moved
-    faulty = positions.copy()
-    exchanged(faulty, 3, 17, 0, 119)
-    faulty[90:, 5] = np.nan
-    monkeypatch.setattr(swaps, "AT_ONCE", 1000)
-    whole = find_order(faulty, RATE, positions, np.linspace(0.006, 0.01, FRAMES))
-    assert (whole[:120, [3, 17]] == [17, 3]).all() and (whole[120:] == np.arange(30)).all()
-    monkeypatch.setattr(swaps, "AT_ONCE", 7)
-    np.testing.assert_array_equal(find_order(faulty, RATE, positions, np.linspace(0.006, 0.01, FRAMES)), whole)
-
-
-def test_frames_are_smoothed_and_solved_some_at_a_time(subject, layout, moved, monkeypatch):
-    """A long sequence is never held whole: windows that overlap, and pieces of what is independent, tell the same."""
-    _, _, positions, _ = moved
-    body = MarkedBody(subject, layout, 1.0, 0.3)
-    config, weights = AnimateConfig(), np.full(positions.shape[:2], 1e4)
-    x = body.body.join(moved[0] + 0.02, moved[1])
-    arguments = x, config.inertia(RATE, body.n_unknowns), body.system, positions, weights
-    whole, alone = body.smooth_step(*arguments), body.solve(x, positions, weights, 5, 1e-6)
-    monkeypatch.setattr(smoothing, "WINDOW", 50)
-    monkeypatch.setattr(smoothing, "OVERLAP", 50)
-    monkeypatch.setattr(marked_body, "MOST", 50)
-    assert np.abs(body.smooth_step(*arguments) - whole).max() < 1e-6
-    pieces = body.solve(x, positions, weights, 5, 1e-6)
-    for one, other in ((pieces.x, alone.x), (pieces.energy, alone.energy), (pieces.converged, alone.converged)):
-        np.testing.assert_allclose(one, other, rtol=1e-9, atol=1e-12)
 
 
 def test_an_exchange_with_a_label_that_no_layout_knows(subject, layout, moved):
@@ -166,7 +126,7 @@ def test_an_exchange_with_a_label_that_no_layout_knows(subject, layout, moved):
     few = layout.select(LABELS[:25])
     faulty = positions.copy()
     exchanged(faulty, 3, 28, 50, 99)
-    found = find_artefacts(subject, changed(faulty), few, CONFIG)
+    found = find_artefacts(subject, changed(faulty), few)
     assert [(e.first, e.second, e.begin, e.end) for e in found.swaps] == [("M3", "M28", 50, 99)]
     np.testing.assert_array_equal(found.repaired.positions, positions)
     assert found.labels == LABELS[:25] and found.bad == ()
@@ -187,35 +147,8 @@ def test_close_labels_are_tried_both_ways(subject, layout, moved):
     np.testing.assert_array_equal(swapped[there[swapped]], np.arange(55, 95))
 
 
-def test_what_a_marker_is_off_by_the_account_of_the_others(subject, layout, moved):
-    """The body that has gone after a displaced marker, corrected, is the one that never saw it."""
-    _, _, positions, _ = moved
-    faulty = positions[:40].copy()
-    faulty[:, 7] += [0.004, 0.01, -0.006]
-    body = Simulation(subject, MarkerSequence(faulty, LABELS, RATE), layout)
-    x = body.follow(faulty)
-    off = faulty - body.body.positions(x)
-    alone = body.alone(off, x, faulty)[:, 7]
-    without = faulty.copy()
-    without[:, 7] = np.nan
-    true = faulty[:, 7] - body.body.positions(body.follow(without))[:, 7]
-    assert np.linalg.norm(off[:, 7] - true, axis=1).mean() > 0.001
-    assert np.linalg.norm(alone - true, axis=1).mean() < 0.4 * np.linalg.norm(off[:, 7] - true, axis=1).mean()
-
-
-def test_bridges_join_both_ends_and_long_ones_pass_the_usual_place():
-    local = np.zeros((100, 1, 3))
-    local[:20], local[20:], local[90:] = 0.01, 0.03, 0.05
-    local[10:20] = local[40:90] = np.nan
-    out = bridge_gaps(local, 15.0)[:, 0, 0]
-    np.testing.assert_allclose(out[9:21], np.interp(np.arange(9, 21), [9, 20], [0.01, 0.03]), atol=1e-12)
-    usual = np.nanmedian(local[:, 0, 0])
-    np.testing.assert_allclose(out[54:75], usual, atol=1e-12)
-    assert np.abs(np.diff(out[38:92])).max() < 0.02 / 15 + 1e-9 and abs(out[89] - out[90]) > 1e-3
-
-
 def test_a_motion_of_other_length_is_refused(subject, layout, moved):
     _, _, positions, _ = moved
-    motion = animate(subject, changed(positions).frames(slice(0, 20)), layout, AnimateConfig())
+    motion = animate(subject, changed(positions).frames(slice(0, 20)), layout)
     with pytest.raises(ValueError, match="motion: expected 160 frames as the markers have, got 20"):
-        find_artefacts(subject, changed(positions), layout, CONFIG, motion)
+        find_artefacts(subject, changed(positions), layout, motion)

@@ -9,10 +9,9 @@ import pytest
 from config_files import config_file
 from mosh_folders import QUICK, QuietWork, small_pictures
 from people_bodies import kept, small_people
-from test_completion_coverage import LEGS
 from test_completion_keypoints import LIMBS
 
-from completion import MarkerSequence, MoshConfig, PersonConfig, angle_table, load_layout, mosh, write_markers
+from completion import MarkerSequence, MoshConfig, PersonConfig, load_layout, mosh, write_markers
 from completion.__main__ import main
 from completion.mocap.files.opensim import write_mot
 from completion.mocap.joint_angles import Known, anatomical_angles
@@ -96,11 +95,6 @@ def test_what_is_no_recording_is_named(wrong, words):
         mosh(wrong)
 
 
-def test_the_order_of_old_calls_is_named():
-    with pytest.raises(ValueError, match=r"recordings: expected a file .*, got ScapeModel"):
-        mosh(small_people(), markers())
-
-
 def test_angles_are_a_table_with_names(monkeypatch, tmp_path):
     """Those of motion.mot: a dict, or with pandas a DataFrame of the same columns."""
     found = mosh(markers(), config=QUICKLY)
@@ -122,15 +116,6 @@ def test_angles_are_a_table_with_names(monkeypatch, tmp_path):
     for name in {"knee_angle_r", "hip_flexion_l", "elbow_flex_r", "lumbar_extension"} & {*table}:
         np.testing.assert_allclose(table[name], written[name], atol=1e-4)
     assert np.ptp(table["knee_angle_r"]) > 30                       # degrees, of a walk
-
-
-def test_angles_that_no_marker_determines_are_left_out(monkeypatch):
-    monkeypatch.setitem(sys.modules, "pandas", None)
-    whole = markers()
-    legs = whole.select([label for label in whole.labels if label in LEGS])
-    found = mosh(legs, config=QUICKLY)
-    assert "knee_angle_r" in found.joint_angles() and "elbow_flex_r" not in found.joint_angles()
-    assert "elbow_flex_r" in angle_table(found.motions[0], found.subject)
 
 
 def test_joint_centres_of_a_video_are_told(tmp_path):

@@ -11,7 +11,6 @@ from completion.mocap.subject import latent_fit as terms
 from completion.mocap.subject.attachment import above_triangles, latent_markers, simulate_markers
 from completion.mocap.subject.latent_fit import LatentPoints
 from model.fitting import energy
-from model.fitting.bodies import FixedBody
 from model.fitting.energy import MovingPoints
 from model.priors import gaussian_prior
 from scanprep.geometry import rotations
@@ -19,7 +18,6 @@ from scanprep.geometry.least_squares import Residual
 
 MODEL = worm_with_prior()
 K, L, REST = MODEL.n_betas, 6, np.zeros((4, 3))
-BODY = FixedBody(MODEL.subject(None))
 LATENT = LatentPoints(MODEL.vertices(REST, np.zeros(K)), MODEL.shape_jacobian(REST))
 LAYOUT = MarkerLayout(tuple("ABCDEF"), np.array([6, 75, 130, 200, 255, 330]), 0.02)
 PRIOR = gaussian_prior(MODEL.pose_mean, MODEL.pose_covariance)

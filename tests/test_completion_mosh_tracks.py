@@ -1,14 +1,12 @@
 """Exchanges, slips and noise of tracks of markers, without a body."""
-import itertools
-from dataclasses import replace
 
 import numpy as np
 import pytest
-from marker_faults import CONFIG, FRAMES, LABELS, RATE, exchanged
+from marker_faults import FRAMES, LABELS, RATE, exchanged
 
 from completion.mocap.artefacts.results import BadSpan, list_swaps
 from completion.mocap.artefacts.slips import find_bad, without_lost_limbs
-from completion.mocap.pose.swaps import AWAY, TORN, Tracks, _two_states, find_order, marker_levels
+from completion.mocap.pose.swaps import AWAY, TORN, Tracks, find_order, marker_levels
 from scanprep.geometry import rotations
 
 
@@ -37,18 +35,6 @@ def test_a_track_of_constant_acceleration_does_not_jump():
     positions[30:34] = np.nan
     tracks = Tracks(positions, RATE)
     assert not tracks.jumped.any() and np.flatnonzero(tracks.open[:, 0]).tolist() == [0, 30, 31, 32, 33, 34]
-
-
-def test_links_tell_which_label_goes_on():
-    positions = wavy()
-    exchanged(positions, 1, 4, 50, 119)
-    tracks = Tracks(positions, RATE)
-    some = np.arange(6)
-    cost = tracks.links(np.full((1, 1), 50), some[:, None], some)
-    assert cost.argmin(axis=1).tolist() == [0, 4, 2, 3, 1, 5] and (np.sort(cost, axis=1)[:, 1:] == TORN).all()
-    positions[45:50, 1] = np.nan                                     # over a gap: not as sure, but still the best
-    cost = Tracks(positions, RATE).links(np.array([50]), np.array([1]), np.array([4]))[0]
-    assert 0 < cost < TORN - 2
 
 
 def test_over_a_gap_a_track_may_have_been_accelerated():
@@ -124,25 +110,11 @@ def test_what_flickers_or_is_gone_is_not_exchanged():
     assert (tracked(positions) == np.arange(6)).all()
 
 
-def test_two_states_are_the_best_of_all_ways():
-    rng = np.random.default_rng(1)
-    for _ in range(30):
-        gains, stay, switch = rng.normal(0, 5, 6), rng.uniform(0, 10, 5), rng.uniform(0, 10, 5)
-
-        def worth(way, gains=gains, stay=stay, switch=switch):
-            change = np.diff(way) != 0
-            return gains[np.array(way, bool)].sum() - np.where(change, switch + 4.0, stay).sum() + stay.sum()
-
-        best = max(itertools.product((0, 1), repeat=6), key=worth)
-        total, swapped = _two_states(gains, stay, switch)
-        assert total == pytest.approx(worth(best)) and swapped.astype(int).tolist() == list(best)
-
-
 # ---- bad spans
 
-def bad(local, jumps=None, **settings):
+def bad(local, jumps=None):
     jumps = np.zeros(local.shape[:2]) if jumps is None else jumps
-    return find_bad(local, local, jumps, LABELS[:local.shape[1]], replace(CONFIG, **settings), RATE)
+    return find_bad(local, local, jumps, LABELS[:local.shape[1]], RATE)
 
 
 def quiet(seed=0):
@@ -159,7 +131,6 @@ def test_a_slip_is_found_at_its_frame_and_a_slow_change_is_none():
     (found,) = bad(local, jumps)
     assert (found.label, found.kind, found.begin, found.end) == ("M2", "slipped", 70, FRAMES - 1)
     assert abs(found.distance - np.sqrt(0.00055)) < 0.001
-    assert bad(local, jumps, slip=0.04) == ()
 
 
 def test_noise_and_strays_are_found_with_their_ends():

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from completion.mocap.artefacts.results import BadSpan, MarkerArtefacts, Swap, artefact_table, write_virtual
-from completion.mocap.files.c3d import _Numbers, point_table, replace_points
+from completion.mocap.files.c3d import point_table, replace_points
 from completion.mocap.files.markers import MarkerFileError, MarkerSequence, read_markers
 
 ezc3d = pytest.importorskip("ezc3d")
@@ -120,11 +120,3 @@ def test_whole_numbers_are_rounded_or_do_not_reach(tmp_path, original):
     assert (read_markers(tmp_path / "far.c3d").positions == 20).all() and len(sequence.labels) == 4
     words = point_table(original, far).words(far)
     np.testing.assert_array_equal(words[:, 4], rows[:, 4] * [0.5, 0.5, 0.5, 1])      # the computed point stays
-
-
-@pytest.mark.parametrize("processor", [84, 85, 86])
-def test_numbers_of_every_processor_come_back(processor):
-    numbers, values = _Numbers(processor), np.random.default_rng(0).normal(0, 1e3, 50).astype(np.float32)
-    np.testing.assert_array_equal(numbers.floats(numbers.encode(values.astype(float), "f4")), values)
-    whole = np.arange(-5, 300, 7)
-    np.testing.assert_array_equal(numbers.words(numbers.encode(whole, "i2"), "i2"), whole)

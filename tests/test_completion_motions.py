@@ -10,7 +10,6 @@ from quiet_pictures import small_pictures  # noqa: F401 -- fixture
 
 from completion.__main__ import main
 from completion.motion import Motion
-from completion.viewing.files import Files
 from model.export.bvh import write_bvh
 from model.motion.onto import read_motion
 from model.rig import joint_places, make_rig
@@ -114,19 +113,6 @@ def test_bad_motions_are_one_clear_line(place, tmp_path, capsys, name, make, wor
 def test_markers_of_a_motion_are_not_asked_for(place, tmp_path, capsys):
     assert run(place, place / "many" / "theirs.bvh", "--layout", "cmu41", "-o", tmp_path / "out") == 1
     assert "a motion has no markers; leave out --layout" in capsys.readouterr().err
-
-
-def test_the_viewer_shows_the_same(place):
-    model = place / "model.npz"
-    for name in ("theirs.bvh", "amass.npz"):
-        content = Files((place / "many" / name,), model).entries()[0].load()
-        assert content.shapes[0].rate in (pytest.approx(24), 100)
-        assert any("copied by the directions of the segments, joint centres" in note for note in content.notes)
-    own = Files((place / "many" / "own.npz",), model).entries()[0].load()
-    assert not own.notes
-    with pytest.raises(ValueError, match=r"theirs\.bvh: a motion needs its model"):
-        Files((place / "many" / "theirs.bvh",)).entries()[0].load()
-    assert [entry.name for entry in Files((place / "many",), model).entries()] == ["amass.npz", "own.npz"]
 
 
 def test_a_motion_of_another_kind_of_model_says_what_to_do(tmp_path):

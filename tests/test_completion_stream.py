@@ -1,5 +1,4 @@
 import copy
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -11,13 +10,11 @@ from completion.mocap.marker_sets.layout import MarkerLayout
 from completion.mocap.pose.follow import AnimateConfig, animate, low_pass
 from completion.mocap.pose.foot_contact import Floor, FootContact
 from completion.mocap.pose.judgement import marker_speed
-from completion.mocap.pose.marked_body import MarkedBody, marker_weights, supports
+from completion.mocap.pose.marked_body import MarkedBody, marker_weights
 from completion.mocap.pose.part_shapes import PartShapes
 from completion.mocap.pose.stream import KalmanPrediction, MarkerStream
 from completion.mocap.pose.swaps import LabelWatch
-from completion.motion import Motion
 from model.features import linear_features
-from model.fitting import energy
 from model.pose_space import PoseSpace
 from model.scape import ScapeModel
 from model.shape_space import ShapeSpace
@@ -69,16 +66,6 @@ def test_part_shapes_are_the_point_operator(subject, layout):
     turns = columns[:, :12].reshape(6, 4, 3, 3, 30).transpose(0, 4, 3, 1, 2)               # (B, L, 3, J, 3)
     got = np.einsum("blijc,bjcd->blijd", turns, rotations.right_jacobian(pose))
     np.testing.assert_allclose(got.reshape(by_pose.shape), by_pose, atol=1e-9)
-
-
-def test_normals_that_turn_with_their_part_are_near_the_exact_ones(subject, layout):
-    body = MarkedBody(subject, layout, 0.3, 0.3)
-    ids, weights = supports(subject.template, layout)
-    poses = MEAN + np.random.default_rng(2).normal(0, 0.25, (40, 4, 3))
-    x = body.body.join(poses, np.zeros((40, 3)))
-    exact = energy.rise_above_skin(subject.points(ids, weights).evaluate(poses), np.asarray(layout.distances))
-    apart = np.linalg.norm(body.positions(x) - exact, axis=2)
-    assert apart.mean() < 0.0007 and np.percentile(apart, 95) < 0.002            # of 12 mm
 
 
 def test_the_derivative_of_the_frame_energy_is_a_finite_difference(subject, layout, sway):
@@ -282,10 +269,10 @@ def test_feet_that_stand_do_not_slide(walker):
 
 def test_feet_do_not_sink_while_walking(walker):
     truth, free = animated(walker, "walk")
-    height = float(np.median(truth[..., 2].min(axis=1))) + 0.01      # a floor a little too high
-    _, held = animated(walker, "walk", ground=True, floor=(0.0, 0.0, 2.0, height))
+    height = Floor.below(free).height
+    _, held = animated(walker, "walk", ground=True)
     sunk_free, sunk = (np.maximum(0, height - v[..., 2].min(axis=1)) for v in (free, held))
-    assert sunk_free.mean() > 0.006 and sunk.mean() < 0.6 * sunk_free.mean()
+    assert sunk.mean() < 0.6 * sunk_free.mean()
     assert np.linalg.norm(held - truth, axis=2).mean() < 0.02
 
 
@@ -296,8 +283,6 @@ def test_the_floor_is_found_whatever_axis_is_up(walker):
     assert floor.normal.tolist() == [0, 0, 1] and abs(floor.height - np.median(vertices[..., 2].min(axis=1))) < 0.01
     turned = Floor.below(vertices @ rotations.exp(np.array([np.pi / 2, 0, 0])).T)  # z becomes -y
     assert turned.normal.tolist() == [0, -1, 0] and abs(turned.height - floor.height) < 1e-9
-    with pytest.raises(ValueError, match="expected a normal and a height"):
-        Floor.from_numbers((0, 0, 0, 1))
 
 
 def test_what_stands_is_held_on_the_floor_and_the_rest_is_free(walker):
@@ -308,21 +293,8 @@ def test_what_stands_is_held_on_the_floor_and_the_rest_is_free(walker):
     places = feet.target_positions(x)
     held = ~np.isnan(places[..., 0])
     assert held.all(axis=0).sum() >= 4 and (feet.floor.above(places[held]) > -1e-9).all()
-    raised = x.copy()
-    raised[:, -1] += 1
-    floor = *feet.floor.normal, feet.floor.height
-    assert np.isnan(FootContact(body, raised, 60.0, floor).target_positions(raised)).all()
-
-
-def test_a_motion_keeps_which_markers_were_trusted(tmp_path):
-    residuals = np.array([[0.01, np.nan], [0.2, 0.01]])
-    motion = Motion(np.zeros((2, 1, 3)), np.zeros((2, 3)), None, 60.0, residuals, ("A", "B"))
-    np.testing.assert_array_equal(motion.trusted, [[True, False], [True, True]])
-    doubted = replace(motion, trusted=np.array([[True, False], [False, True]]))
-    doubted.save(tmp_path / "m.npz")
-    np.testing.assert_array_equal(Motion.load(tmp_path / "m.npz").trusted, doubted.trusted)
-    with pytest.raises(ValueError, match="trusted: expected shape"):
-        replace(motion, trusted=np.ones((2, 3), dtype=bool))
+    x[40:, -1] += 1                                                  # as if standing in the air
+    assert np.isnan(FootContact(body, x, 60.0).target_positions(x)[45:]).all()
 
 
 @pytest.fixture(scope="module")
@@ -359,33 +331,3 @@ def test_one_frame_that_no_body_makes_is_passed_over(passing, unbroken, wrong):
     for there, other in zip(frames[1:], clean[1:], strict=True):
         assert other.converged and there.converged
         np.testing.assert_array_equal(there.trusted, other.trusted)
-
-
-@pytest.mark.slow
-def test_a_stream_does_not_begin_with_a_frame_that_no_body_makes(passing):
-    subject, layout, truth, positions = passing
-    broken = positions[:20].copy()
-    broken[:3] *= 1000
-    frames = pushed(MarkerStream(subject, layout, layout.labels, 60.0, CONFIG), broken)
-    assert all(np.isnan(f.pose).all() and not f.trusted.any() and not f.converged for f in frames[:3])
-    assert errors(subject, frames[3:], truth[3:20]).max() < 0.01
-
-
-@pytest.mark.slow
-def test_a_body_far_from_every_frame_is_followed_in_the_end_and_trusts_none(passing):
-    subject, layout, _, positions = passing
-    frames = pushed(MarkerStream(subject, layout, layout.labels, 60.0, CONFIG), 1.5 * positions[:22])
-    assert not any(f.trusted.any() for f in frames)
-    assert np.isfinite([f.pose for f in frames[-5:]]).all()
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("wrong", ["times 1000", "half of it"])
-def test_one_frame_that_no_body_makes_leaves_the_others_of_a_sequence(passing, wrong):
-    subject, layout, truth, positions = passing
-    broken = positions.copy()
-    broken[33] = WRONG[wrong](positions[33])
-    motion = animate(subject, MarkerSequence(broken, layout.labels, 60.0), layout, CONFIG)
-    apart = np.linalg.norm(motion.vertices(subject) - truth, axis=2).mean(axis=1)
-    assert apart.max() < 0.015
-    assert motion.trusted[33].sum() < 30 and motion.trusted[np.arange(60) != 33].all()

@@ -4,7 +4,6 @@ import time
 
 import numpy as np
 import pytest
-from browser import wait_until
 from completion_bodies import MARKS, POSE, QUICK, TRANS, worm_with_prior
 from config_files import config_file
 
@@ -18,7 +17,6 @@ from scanprep.batch.opening import workspace
 from scanprep.geometry.files import write_mesh
 from scanprep.geometry.landmarks import write_landmarks
 from scanprep.viewer.messages import Message
-from scanprep.viewer.server import Server
 
 LABELS = tuple(f"M{i:02d}" for i in range(12))
 NAMES = [f"mark {i}" for i in range(len(MARKS))]
@@ -85,39 +83,6 @@ def test_markers_are_clicked_beside_the_landmarks_and_saved_as_a_layout(worn, tm
     assert_there(worn, tmp_path / "out" / "layout.json")
     rows = {m["metric"]: m["value"] for m in json.loads((tmp_path / "out" / "report.json").read_text())["metrics"]}
     assert rows["markers clicked"] == 12 and rows["landmarks used"] == len(MARKS)
-    app.close()
-
-
-@pytest.mark.slow
-def test_the_page_tells_markers_from_landmarks(worn, new_page, tmp_path):
-    app = app_of(worn, tmp_path)
-    with workspace(tmp_path / "out"), Server(app, say=lambda line: None) as server:
-        page = new_page(viewport={"width": 1300, "height": 800})
-        page.goto(server.opening())
-        wait_until(page, "Boolean(window.program?.figure && program.state)")
-        page.get_by_label("another name").fill("cmu41")
-        page.get_by_label("another name").press("Enter")
-        wait_until(page, "program.state.names.length === 48")
-        for label in ("LELB", "RELB"):
-            page.locator(".sk-names li").filter(has_text=label).click()
-            wait_until(page, f"program.state.chosen === '{label}'")
-            page.evaluate("""() => { const p = program.state;
-                const at = program.figure.panes[1].layers[0].positions, o = program.figure.panes[1].origin.toArray();
-                program.send("place", { pane: 1, name: p.chosen, origin: o, direction: [0, 0, 1],
-                  seen: [at[0] + o[0], at[1] + o[1], at[2] + o[2]] }); }""")
-            wait_until(page, f"'{label}' in program.state.panes[1].places")
-        assert page.get_by_role("button", name="complete with 7 landmarks").is_visible()
-        assert "2 markers" in page.locator(".sk-file").filter(has_text="layout.json").inner_text()
-        assert page.evaluate("document.documentElement.scrollWidth") <= 1300 and page.errors == []
-    app.close()
-
-
-def test_a_marker_set_brings_its_labels(worn, tmp_path):
-    app = app_of(worn, tmp_path)
-    sent(app, "choose", name="cmu41")
-    assert len(app.names) == len(NAMES) + 41 and app.chosen in app.names and "cmu41" not in app.names
-    sent(app, "choose", name="my own")
-    assert app.names[-1] == app.chosen == "my own"
     app.close()
 
 

@@ -189,7 +189,7 @@ def test_motions(tmp_path, case, words):
         labels[order] = np.array(LABELS, dtype=object)[back]
         markers = dataclasses.replace(markers, labels=tuple(labels))
     write_markers(tmp_path / "walk.csv", markers)
-    work = Follow(model, "model.npz", str(tmp_path / "layout.json"), model.subject(None), None, None, "m", None, None,
+    work = Follow(model, "model.npz", str(tmp_path / "layout.json"), model.subject(None), None, None, "m", None,
                   AnimateConfig(), PersonConfig())
     check(work(tmp_path / "walk.csv", TaskContext(tmp_path / "out")), words)
     assert (tmp_path / "out" / "motion.npz").exists()

@@ -11,7 +11,7 @@ from model_bodies import random_poses
 
 from completion.mocap.files.markers import MarkerSequence
 from completion.mocap.marker_sets.layout import MarkerLayout
-from completion.mocap.pose.follow import AnimateConfig, animate
+from completion.mocap.pose.follow import animate
 from completion.partial.completion import complete
 from completion.partial.settings import CompletionConfig
 from model import files
@@ -280,8 +280,7 @@ def test_markers_are_animated(model):
     layout = MarkerLayout(tuple(f"M{i}" for i in range(30)), np.random.default_rng(4).choice(396, 30, replace=False),
                           0.012)
     positions = np.stack([layout.place(subject.template.with_vertices(v)) for v in meshes])
-    motion = animate(subject, MarkerSequence(positions, layout.labels, 100.0), layout,
-                     AnimateConfig(smoothing=0))
+    motion = animate(subject, MarkerSequence(positions, layout.labels, 100.0), layout)
     assert np.linalg.norm(motion.vertices(subject) - meshes, axis=2).mean(axis=1).max() < 0.01
 
 

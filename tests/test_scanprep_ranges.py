@@ -198,7 +198,7 @@ def test_ranges_in_words():
     with pytest.raises(OutOfRangeError, match=r"^annealing: expected above 0, got 0\.0$"):
         PersonConfig(annealing=(1.0, 0.0))
     with pytest.raises(OutOfRangeError, match="outlier"):
-        dataclasses.replace(MoshConfig().person, outlier=float("nan"))
+        dataclasses.replace(MoshConfig().poses, outlier=float("nan"))
 
 
 def test_settings_survive_json():

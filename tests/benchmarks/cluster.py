@@ -77,7 +77,7 @@ def repeat(once: Path, place: Path, count: int) -> Path:
 
 def arguments(command: str, inputs: Path, model: Path, output: Path, workers: str) -> list[str]:
     """The whole command line."""
-    more = {"complete": ["-m", str(model)], "mosh": ["--subjects", "each"], "track": ["--subject", "template"]}[command]
+    more = {"complete": ["-m", str(model)], "mosh": [], "track": ["--subject", "template"]}[command]
     work = [] if command == "track" else ["--workers", workers]
     return [sys.executable, "-m", "completion", command, str(inputs), "-o", str(output), *more, *work]
 

@@ -46,7 +46,7 @@ def held_out_poses(data: RealData, model: ScapeModel, fold: int, count: int) -> 
         layout = MarkerLayout(tuple(f"M{k}" for k in range(count)),
                               rng.choice(len(body.vertices), count, replace=False), 0.0)
         sequence = MarkerSequence(layout.place(body)[None], layout.labels, 100.0)
-        motion = animate(subject, sequence, layout, AnimateConfig(smoothing=0))
+        motion = animate(subject, sequence, layout)
         apart = 1e3 * np.linalg.norm(motion.vertices(subject)[0] - body.vertices, axis=1)
         rows.append({"pose": int(i), "surface_mm": float(apart.mean()), "worst_mm": float(apart.max()),
                      "markers_mm": float(1e3 * np.nanmean(motion.residuals))})

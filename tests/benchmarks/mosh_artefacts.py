@@ -23,7 +23,7 @@ from marker_motion import dropped
 from protocols import load_real, machine, spring_split, write_report
 
 from completion.mocap.artefacts.find import find_artefacts
-from completion.mocap.artefacts.results import ArtefactConfig, BadKind, BadSpan, Swap
+from completion.mocap.artefacts.results import BadKind, BadSpan, Swap
 from completion.mocap.files.markers import MarkerSequence, read_markers
 from completion.mocap.marker_sets.layout import MarkerLayout
 from completion.mocap.marker_sets.named import load_layout
@@ -199,7 +199,7 @@ def turned(subject: Subject, layout: MarkerLayout, motion: Motion) -> np.ndarray
     return subject.skeleton.part_rotations(motion.poses)[:, part]
 
 
-def run_case(model: BodyModel, case: Case, config: ArtefactConfig, seed: int) -> dict[str, object]:
+def run_case(model: BodyModel, case: Case, seed: int) -> dict[str, object]:
     """All faults on one sequence."""
     rng = np.random.default_rng(seed)
     subject, layout, motion = followed(model, case, case.markers)
@@ -209,33 +209,33 @@ def run_case(model: BodyModel, case: Case, config: ArtefactConfig, seed: int) ->
         reference = surface(*case.truth)
         clean = float(np.linalg.norm(surface(subject, motion) - reference, axis=2).mean())
     start = time.process_time()
-    plain = find_artefacts(subject, case.markers, layout, config)
+    plain = find_artefacts(subject, case.markers, layout)
     seconds = time.process_time() - start
     row: dict[str, object] = {"case": case.name, "clean_mm": 1e3 * clean, "alarms": [
         str(span) for span in (*plain.swaps, *plain.bad)], "frames_per_cpu_s": len(reference) * 10 / seconds}
     for close in (False, True):
         faulty = exchanged(case.markers, 0.1, close, rng)
         gone = dataclasses.replace(faulty, markers=dropped(faulty.markers, 0.05, 0.25, rng))
-        row["close" if close else "random"] = run_exchanges(model, case, gone, reference, clean, config)
+        row["close" if close else "random"] = run_exchanges(model, case, gone, reference, clean)
     turns = turned(subject, layout.select(layout.match_labels(case.markers.labels)), motion)
     known = case.markers.select(layout.match_labels(case.markers.labels))
     for kind in KINDS:
         faulty = spoilt(known, kind, 6, turns, rng)
-        found = find_artefacts(subject, faulty.markers, layout, config)
+        found = find_artefacts(subject, faulty.markers, layout)
         fresh = [b for b in found.bad if b.kind == kind]
         row[kind] = scores(fresh, faulty.bad, faulty.markers) | {
             "exchanges": len(found.swaps), "other": len(found.bad) - len(fresh)}
     return row
 
 
-def run_exchanges(model: BodyModel, case: Case, faulty: Faulty, reference: np.ndarray, clean: float,
-                  config: ArtefactConfig) -> dict[str, float]:
+def run_exchanges(model: BodyModel, case: Case, faulty: Faulty, reference: np.ndarray, clean: float
+                  ) -> dict[str, float]:
     """Find exchanges, and what is left of them in the motion: all from the faulty markers alone, seconds too."""
     person = find_person(model, faulty.markers, case.layout)
     subject = model.subject(person.betas)
     raw = animate(subject, faulty.markers, person.layout, POSES)
     start = time.process_time()
-    result = mosh(faulty.markers, model, case.layout, MoshConfig(artefacts=config, soft_tissue=False))
+    result = mosh(faulty.markers, model, case.layout, MoshConfig(soft_tissue=False))
     seconds, found = time.process_time() - start, result.artefacts[0]
     mended = model.subject(result.betas), result.layout, result.motions[0]
     away = [float(np.linalg.norm(surface(s, m) - reference, axis=2).mean())
@@ -276,17 +276,16 @@ def main() -> None:
     parser.add_argument("--held-out", action="store_true", help="the 45 men kept for the end")
     parser.add_argument("--seed", type=int, default=0)
     args = parser.parse_args()
-    model, config, rows = load_model(args.model), ArtefactConfig(), []
+    model, rows = load_model(args.model), []
     for case in cases(model, args):
-        row = run_case(model, case, config, args.seed)
+        row = run_case(model, case, args.seed)
         rows.append(row)
         print("\n".join([f"{name:18s} {value}" for name, value in row.items()]), flush=True)
     total = {kind: shares([{k: v for k, v in row[kind].items()} for row in rows])  # type: ignore[attr-defined]
              for kind in ("random", "close", *KINDS)}
     for kind, values in total.items():
         print(f"{kind:10s} " + "  ".join(f"{name} {value:.3g}" for name, value in values.items()), flush=True)
-    write_report(args.output, {"machine": machine(), "config": dataclasses.asdict(config), "rows": rows,
-                               "total": total})
+    write_report(args.output, {"machine": machine(), "rows": rows, "total": total})
 
 
 if __name__ == "__main__":

@@ -98,18 +98,16 @@ def measure(model: BodyModel, found: Character, soft: SoftTissue, factor: float,
     fixed, changed = moving_character(found.model, moved, frames)
     _, person = moving_character(model, soft, frames)
     poses, row = soft.motion.poses[frames], {"factor": factor, "frames": len(frames)}
-    creases = {"": Creases(at_rest(found.model), model.skeleton), " of own part": Creases(at_rest(found.model),
-                                                                                        model.skeleton, 0)}
+    creases = Creases(at_rest(found.model), model.skeleton)
     start = time.process_time()
-    smooth = creases[""].smooth(changed, poses)
+    smooth = creases.smooth(changed, poses)
     row["smoothing_ms"] = MM * (time.process_time() - start) / len(frames)
     row["smoothing_moved_mm"] = MM * float(np.linalg.norm(smooth - changed, axis=2).max())
     theirs = Creases(at_rest(model, soft.motion.betas), model.skeleton).find_inverted(person, poses)
     row["turned_on_person"] = int(theirs.sum())
-    for kind, each in creases.items():
-        before, after = each.find_inverted(changed, poses), each.find_inverted(smooth, poses)
-        row |= {f"turned{kind}": int(before.sum()), f"turned{kind}, smoothed": int(after.sum())}
-    row["worst_frame"] = int(creases[""].find_inverted(changed, poses).sum(axis=1).max())
+    before, after = creases.find_inverted(changed, poses), creases.find_inverted(smooth, poses)
+    row |= {"turned": int(before.sum()), "turned, smoothed": int(after.sum()),
+            "worst_frame": int(before.sum(axis=1).max())}
     share = deformation(model.template.faces, fixed, changed)
     return row | {"deformed_mean": float(share.mean()), "deformed_most": float(np.percentile(share, 99.9)),
                   "moved_by_soft_tissue_mm": float(MM * np.linalg.norm(changed - fixed, axis=2).mean())}
@@ -144,7 +142,7 @@ def main() -> None:
             rows.append({**about, **measure(model, found, soft, factor, frames)})
             print(rows[-1], flush=True)
         moved = retarget_soft_tissue(soft, model, found.model, max(args.factors))
-        save_png(args.folder / f"{name}.png", picture_transfer(model, soft, found.model, moved, 8))
+        save_png(args.folder / f"{name}.png", picture_transfer(model, soft, found.model, moved))
         write_character(args.folder / f"{name}.glb", found.model, moved)
     write_report(args.output, {"motion": str(args.c3d or "embedded walk"), "machine": machine(),
                                                "rows": rows})

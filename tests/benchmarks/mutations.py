@@ -403,7 +403,7 @@ MUTATIONS = (
         ("E_S annealed", "state.greatest, c.surface)", "state.greatest, factor * c.surface)"),
         ("weights per square metre", "CENTIMETRES = 100.0", "CENTIMETRES = 1.0"),
         ("published weight of E_S", "surface=100.0, initial=0.25", "surface=10.0, initial=0.25"),
-        ("published weight of E_beta", "flexion=0.0, outlier=1000.0", "flexion=0.0, shape=0.5, outlier=1000.0"),
+        ("published weight of E_beta", "initial=0.25, published=True", "initial=0.25, shape=0.5, published=True"),
         ("wands inwards", "np.where(free, distances + wand, distances)", "np.where(free, distances - wand, distances)"),
         ("bars never on the skin", "np.where(free, np.minimum(distances, DISTANCE), distances)", "distances"),
         ("wands of every marker", "np.isin(layout.labels, layout.wands) |", "np.isfinite(distances) |"),

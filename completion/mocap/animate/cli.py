@@ -1,13 +1,13 @@
 """The command `scape animate`."""
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from shlex import quote
 from typing import Annotated
 
 import numpy as np
 
-from model.body import Up
 from model.linear import Subject
 from model.posing.cli import read_subject
 from scanprep.arguments import Place, UsageError
@@ -34,8 +34,8 @@ MarkersArg = Annotated[Path, Place("MARKERS")]
 
 def animate_markers(markers: MarkersArg, output: Output, model: ModelOrNone = None, layout: str | None = None,
                     subject: str | None = None, unit: PersonUnit | None = None, rate: Positive | None = None,
-                    subject_prefix: str | None = None, retarget_to: Path | None = None, betas_to: Path | None = None,
-                    unlabelled: bool = False, up: Up | None = None, config: AnimateConfig = AnimateConfig(),
+                    retarget_to: Path | None = None, betas_to: Path | None = None, unlabelled: bool = False,
+                    ground: bool = False, config: AnimateConfig = AnimateConfig(),
                     person: PersonConfig = PersonConfig(), angles: AngleConfig = AngleConfig(),
                     workers: Workers = Workers(), *, space: Workspace) -> Outcome:
     """The motion of a person from markers, and the person; or a motion of another skeleton on a body.
@@ -69,14 +69,12 @@ def animate_markers(markers: MarkersArg, output: Output, model: ModelOrNone = No
         unit: Unit of the markers, where the file cannot tell; "unknown": that in which they span a person. Of a BVH,
             else cm.
         rate: Frames a second, where the file does not say or says it wrongly; of key poses, else 30.
-        subject_prefix: Whose markers, in a file with several people: what stands before the colon of their labels.
-            Several, as Head,Trunk, are of one person.
         retarget_to: Another person who makes the motion too, as betas or a mesh: onto.npz, onto.glb.
         betas_to: Betas into which the body changes, in JSON: those at the end [b1, b2, ...], keys in seconds
             {"0": [...], "2.5": [...]}, or [[b1, b2, ...], ...] of every frame: morph.glb.
         unlabelled: The markers have no names: they are labelled first, as by `scape label`; --layout says which are
             worn.
-        up: Axis of the model that points up, which GLB and BVH turn to y; else as the model says.
+        ground: Foot contact: feet do not sink into the floor and do not slide while they stand on it.
         config: Settings.
         person: Settings of the person from markers.
         angles: Settings of the joint angles.
@@ -89,22 +87,19 @@ def animate_markers(markers: MarkersArg, output: Output, model: ModelOrNone = No
     if twice := sorted({name for name in names if names.count(name) > 1}):      # written over each other
         raise ValueError(f"{markers}: expected files of different names, {twice[0]} comes with several endings")
     # flags that contradict each other
-    if markers.is_file() and names_motion(markers) and (layout or subject_prefix or unlabelled):
-        raise ValueError(f"{markers}: a motion has no markers; leave out --layout, --subject-prefix and --unlabelled")
+    if markers.is_file() and names_motion(markers) and (layout or unlabelled):
+        raise ValueError(f"{markers}: a motion has no markers; leave out --layout and --unlabelled")
     if unlabelled and layout is None:
         raise UsageError("--unlabelled: expected --layout: which markers are worn, of scape layout list")
-    if unlabelled and subject_prefix:
-        raise UsageError("--unlabelled: markers without names have no --subject-prefix")
     # model, subject and all that the files share
+    config = replace(config, ground=ground or config.ground)
     units = resolve_marker_unit([markers], unit)
     loaded, name = read_model(model)
-    loaded = loaded.with_up(up)
     body = loaded if subject == "markers" else body_of(loaded, subject, unit)
     work = AnimateTask(loaded, name, None if layout is None else layout_or_file(layout),
                        body if isinstance(body, Subject) else None,
                        None if retarget_to is None else read_subject(loaded, retarget_to, unit),
-                       None if betas_to is None else read_betas_to(betas_to, loaded.n_betas), units, subject_prefix,
-                       rate,
+                       None if betas_to is None else read_betas_to(betas_to, loaded.n_betas), units, rate,
                        config, person, unlabelled, angles)
     settings = {"animate": config, "person": person, "angles": angles, "model": name}
     if markers.is_file():

@@ -103,11 +103,8 @@ def transfer_figures(found: BodyMotion) -> list[Metric]:
         out.append(Metric("bones rolled otherwise at rest, allowed for", ", ".join(rolled)))
     # errors of joint centres and of the directions of segments
     if found.fit is not None:
-        distance = MM * found.fit.distances
         out += [Metric(MEAN_DISTANCE, MM * found.fit.distance, "mm"),
-                Metric("distance of joint centres, 95th percentile", float(np.percentile(distance, 95)), "mm"),
                 Metric("angle of segments, mean", found.fit.angle, "°"),
-                Metric("angle of segments, 95th percentile", float(np.percentile(found.fit.angles, 95)), "°"),
                 Metric("trunk leans otherwise at rest, allowed for", found.fit.lean, "°")]
     return out
 

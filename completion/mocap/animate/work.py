@@ -31,7 +31,7 @@ from ...motion_pictures import (
 )
 from ..angle_conventions import AngleConfig, define_segments, find_landmarks
 from ..angle_errors import expect_angle_errors
-from ..files.markers import MarkerSequence, read_markers
+from ..files.markers import MarkerSequence, marker_subjects, read_markers
 from ..files.motion_files import write_glb, write_motion_folder
 from ..files.opensim import remove_distrusted
 from ..joint_angles import Known, angle_doubts
@@ -63,7 +63,6 @@ class AnimateTask:
     retarget_to: Subject | None          # another person, to whom the motion is retargeted
     betas_to: BetasTo | None             # how the shape changes over the motion
     unit: str | None                     # as for `read_markers`
-    who: str | None
     rate: float | None                   # frames a second, where a file does not say
     animate: AnimateConfig
     person: PersonConfig
@@ -102,7 +101,11 @@ class AnimateTask:
             file = label_first(context, "", path, self.subject or self.model, usual, self.unit, self.rate)
             sequence, labelling = file.markers, file.judgement
         else:
-            sequence = read_markers(path, self.unit, self.who, self.rate)
+            people = marker_subjects(path)
+            if len(people) > 1:
+                raise ValueError(f"{path}: expected the markers of one person, found {', '.join(people)}: scape mosh "
+                                 "takes them apart")
+            sequence = read_markers(path, self.unit, rate=self.rate)
         layout, name = choose_layout(self.model, self.layout, sequence.labels)
         find_landmarks(self.angles, self.model, layout)      # an error now, not after the fit
         metrics = [Metric("model", self.name), Metric("layout", name)]

@@ -9,17 +9,16 @@ from ...motion import Motion, Progress
 from ..files.markers import MarkerSequence
 from ..marker_sets.layout import MarkerLayout
 from ..pose import swaps
-from ..pose.follow import between_keys, span_with_markers
+from ..pose.follow import SMOOTH_ROUNDS, between_keys, span_with_markers
 from ..pose.marked_body import AnimateConfig, MarkedBody, batches, marker_weights, median_of_known
-from .results import ArtefactConfig, BadSpan, MarkerArtefacts, list_swaps
+from .results import BadSpan, MarkerArtefacts, list_swaps
 from .slips import find_bad, without_lost_limbs
 
 FOLLOW = AnimateConfig()             # settings of the body that follows the markers
 ROUNDS = 6                           # most rounds of repairing markers and following them again
 
 
-def find_artefacts(subject: Subject, markers: MarkerSequence, layout: MarkerLayout,
-                   config: ArtefactConfig | None = None, motion: Motion | None = None,
+def find_artefacts(subject: Subject, markers: MarkerSequence, layout: MarkerLayout, motion: Motion | None = None,
                    progress: Progress | None = None, known: MarkerArtefacts | None = None) -> MarkerArtefacts:
     """Find swapped labels, and markers that slip, jitter or stray.
 
@@ -35,8 +34,6 @@ def find_artefacts(subject: Subject, markers: MarkerSequence, layout: MarkerLayo
         Positions (T, L, 3) in metres.
     layout : MarkerLayout
         Where on the person the markers sit. Swaps are also found among labels that it does not know.
-    config : ArtefactConfig, optional
-        Settings.
     motion : Motion, optional
         Known motion of the person with the markers that `known` has repaired, or else `relabel_by_tracks`.
     progress : callable, optional
@@ -66,7 +63,6 @@ def find_artefacts(subject: Subject, markers: MarkerSequence, layout: MarkerLayo
 
     [MoSh]
     """
-    config = config or ArtefactConfig()
     if motion is not None and len(motion.poses) != len(markers.positions):
         raise ValueError(f"motion: expected {len(markers.positions)} frames as the markers have, "
                          f"got {len(motion.poses)}")
@@ -96,7 +92,7 @@ def find_artefacts(subject: Subject, markers: MarkerSequence, layout: MarkerLayo
             tracks = swaps.Tracks(swaps.apply_order(markers.positions, order)[:, body.rows], markers.rate)
             off = tracks.positions - simulated
             spans = find_bad(body.local(off, x), body.local(body.alone(off, x, repaired), x),
-                             np.where(tracks.jumped, tracks.off, 0), body.labels, config, markers.rate)
+                             np.where(tracks.jumped, tracks.off, 0), body.labels, markers.rate)
             bad = without_lost_limbs(spans, body.neighbours, body.labels)
             near = x if len(bad) == len(spans) else None
         if progress:
@@ -169,7 +165,7 @@ class Simulation:
                 targets = some
         x = between_keys(self.body, targets, self.rate, FOLLOW) if near is None else near.copy()
         inside, stiffness = span_with_markers(targets), FOLLOW.inertia(self.rate, self.body.n_unknowns)
-        for _ in range(FOLLOW.smoothing):
+        for _ in range(SMOOTH_ROUNDS):
             weights = self.weights(x[inside], targets[inside])
             x[inside] = self.body.smooth_step(x[inside], stiffness, self.body.system, targets[inside], weights)
         return x

@@ -9,7 +9,6 @@ import numpy as np
 
 from scanprep.console import say
 from scanprep.geometry import storage
-from scanprep.ranges import Settings
 
 from ..files.c3d import point_table, replace_points, write_c3d
 from ..files.c3d_points import add_points
@@ -17,32 +16,6 @@ from ..files.markers import MarkerSequence, subject_columns, write_markers
 from ..files.opensim import unlike
 from ..files.text import MarkerFileError
 from ..pose.marked_body import stretches
-
-
-@dataclass(frozen=True)
-class ArtefactConfig(Settings):
-    """Settings of `find_artefacts`.
-
-    Attributes
-    ----------
-    slip : float, metres
-        Least lasting displacement of a marker in the frame of its body part.
-    stray : float, metres
-        Least distance from the simulated marker for a marker that strays for a while.
-    noise : float, metres
-        Least jitter from frame to frame, as the median length of the second difference.
-
-    Examples
-    --------
-    >>> ArtefactConfig(slip=0.02).stray
-    0.06
-
-    [MoSh]
-    """
-
-    slip: float = 0.015
-    stray: float = 0.06
-    noise: float = 0.012
 
 
 @dataclass(frozen=True, eq=False)

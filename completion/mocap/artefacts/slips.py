@@ -7,13 +7,16 @@ import numpy as np
 from scipy.ndimage import binary_dilation, median_filter
 
 from ..pose.marked_body import median_of_known, stretches
-from .results import ArtefactConfig, BadKind, BadSpan
+from .results import BadKind, BadSpan
 
 SLIP_SUDDEN = 0.6                    # least share of a slip that happens within a tenth of a second
+# metres: least lasting displacement, least distance of a stray marker, and least jitter (median length of the second
+# difference); with these tests/benchmarks/mosh_artefacts.py finds all slipped, stray and noisy markers
+SLIP, STRAY, NOISE = 0.015, 0.06, 0.012
 
 
-def find_bad(off: np.ndarray, alone: np.ndarray, jumps: np.ndarray, labels: tuple[str, ...], config: ArtefactConfig,
-             rate: float) -> tuple[BadSpan, ...]:
+def find_bad(off: np.ndarray, alone: np.ndarray, jumps: np.ndarray, labels: tuple[str, ...], rate: float
+             ) -> tuple[BadSpan, ...]:
     """Find the bad spans of markers with offsets (T, L, 3), metres, in the frames of their parts, NaN where not seen.
 
     `off` is for a body that follows all markers, `alone` for one that follows the others; `jumps` (T, L), metres.
@@ -26,7 +29,7 @@ def find_bad(off: np.ndarray, alone: np.ndarray, jumps: np.ndarray, labels: tupl
     jitter = [np.pad(np.linalg.norm(np.diff(track, 2, axis=0), axis=1), 1, mode="edge") if len(track) > 2
               else np.zeros(len(track)) for track in tracks]
     known = [np.median(q) for q in jitter if len(q)]
-    limit = max(config.noise, noise_usual * float(np.median(known))) if known else config.noise
+    limit = max(NOISE, noise_usual * float(np.median(known))) if known else NOISE
     out: list[BadSpan] = []
     for i, label in enumerate(labels):
         visible = np.flatnonzero(np.isfinite(off[:, i, 0]))
@@ -35,11 +38,11 @@ def find_bad(off: np.ndarray, alone: np.ndarray, jumps: np.ndarray, labels: tupl
         own, leap, gap = off[visible, i], jumps[visible, i], np.r_[False, np.diff(visible) > 1]
         # the three kinds, in this order: a later one is looked for outside the earlier ones
         noisy = _noisy(jitter[i], limit, rate)
-        slip = _slip(alone[visible, i], ~noisy, leap, config.slip, rate)
+        slip = _slip(alone[visible, i], ~noisy, leap, SLIP, rate)
         before = ~noisy & (np.arange(len(visible)) < slip)
         middle = np.median(own[before] if before.any() else own, axis=0)
         away = np.linalg.norm(own - middle, axis=1)
-        stray = _stray(away, np.maximum(config.stray, stray_usual * usual[visible]), leap, gap) & before
+        stray = _stray(away, np.maximum(STRAY, stray_usual * usual[visible]), leap, gap) & before
         slipped = np.arange(len(visible)) >= slip
         # frames of each kind as spans
         kinds: tuple[tuple[BadKind, np.ndarray], ...] = (("noisy", noisy), ("slipped", slipped), ("stray", stray))

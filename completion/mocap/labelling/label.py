@@ -383,7 +383,7 @@ def _of_each(bodies: Sequence[_Person], values: np.ndarray) -> list[np.ndarray]:
 
 def _own(subject: Subject, layout: MarkerLayout) -> MarkedBody:
     """Return a known person with its markers."""
-    return MarkedBody(subject, layout, AnimateConfig.prior_weight, AnimateConfig.prior_shrinkage)
+    return MarkedBody(subject, layout, AnimateConfig.prior_weight)
 
 
 def _sequence(points: np.ndarray, columns: np.ndarray, layout: MarkerLayout, rate: float) -> MarkerSequence:

@@ -13,7 +13,7 @@ from scanprep.batch.calls import KeptCall
 
 from ...cli import read_model
 from .mosh import MoshConfig
-from .recordings import Actor, Grouping, find_actors
+from .recordings import Actor, find_actors
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,7 +36,6 @@ class MoshCall(KeptCall):
     model: tuple[Path, ...] = ()
     layout: str | None = None
     subjects: str = "auto"
-    hold_out: tuple[str, ...] = ()
     retarget_to: Path | None = None
     unit: str | None = None
     rate: float | None = None
@@ -46,7 +45,7 @@ class MoshCall(KeptCall):
 
     def actors(self, output: Path) -> list[Actor]:
         """Return the people of the recordings that are there now."""
-        return find_actors(self.markers, Grouping.of(self.subjects), output)
+        return find_actors(self.markers, self.subjects, output)
 
     def models(self) -> Models:
         """Load all models that were named; UsageError for a number other than none, one or three."""

@@ -23,7 +23,7 @@ from ..files.markers import resolve_marker_unit
 from ..marker_sets.named import choose_layout
 from .call import MoshCall
 from .mosh import MoshConfig
-from .recordings import TABLE, Actor, Grouping, write_grouping
+from .recordings import TABLE, subjects_table, write_grouping
 from .work import ERRORS, FIXED, MoshTask
 
 MarkersArg = Annotated[tuple[Path, ...], Place("MARKERS [MARKERS ...]")]
@@ -31,7 +31,7 @@ Models = Annotated[tuple[Path, ...], Alias("-m", each=True)]
 
 
 def mosh_markers(markers: MarkersArg, output: Output, model: Models = (), layout: str | None = None,
-                 subject_prefix: Annotated[str, Called("--subjects")] = "auto", hold_out: tuple[str, ...] = (),
+                 subject_prefix: Annotated[str, Called("--subjects")] = "auto",
                  retarget_to: Annotated[Path | None, Called("--character")] = None, unit: PersonUnit | None = None,
                  rate: Positive | None = None, unlabelled: bool = False, static: Path | None = None,
                  config: MoshConfig = MoshConfig(),
@@ -53,11 +53,10 @@ def mosh_markers(markers: MarkersArg, output: Output, model: Models = (), layout
     and foot offs, those of the C3D file if it has them) and gait_cycles.csv (joint angles over the gait cycle). Of a
     C3D file with force plates also grf.mot (forces for OpenSim).
 
-    Files that are named are of one person. In a folder every sub-folder is a person; of files that lie side by side
-    those are, whose names begin with the same number, as 85_02.c3d and 85_03.c3d, or else whose labels begin with the
-    same `Subject:`. Several people in one file, Ann:LKNE and Bob:LKNE, have a folder each; a prop beside them is left
-    out. What was found is printed, and kept in subjects.csv, which --subjects takes when it is mended. Called again,
-    the command leaves alone what is done and has not changed; killed, it goes on where it was.
+    Files that are named are of one person. In a folder every sub-folder is a person, and so is every file beside
+    them. Several people in one file, Ann:LKNE and Bob:LKNE, have a folder each; a prop beside them is left out. What
+    was found is printed, and kept in subjects.csv, which --subjects takes when it is mended. Called again, the command
+    leaves alone what is done and has not changed; killed, it goes on where it was.
 
     Args:
         markers: C3D, TRC, CSV or TSV files, or folders of these.
@@ -67,11 +66,8 @@ def mosh_markers(markers: MarkersArg, output: Output, model: Models = (), layout
         layout: Where the markers usually sit: one of `scape layout list`, or a JSON file {"markersets":
             [{"distance_from_skin": metres, "indices": {label: vertex}}]}. Without it the named one that fits best.
         subject_prefix: Who is who: a CSV file with the columns file and subject, or JSON {file: subject}, where files
-            that are left out are not used; or a rule: "name", by what stands before the first _, - or blank of the file
-            name; "label", by what stands before the colon of the labels; "each", every file is of another person;
-            "all", they are of one; "auto". Or whose markers, in files with several people: what stands before the
+            that are left out are not used. Or whose markers, in files with several people: what stands before the
             colon of the labels, as Ann; several, as Head,Trunk, are of one person.
-        hold_out: Labels of markers that no stage sees, which then tell how well the body predicts.
         retarget_to: Model whose mean is a character, which makes the motion too: character.glb.
         unit: Unit of the markers, where the file cannot tell; "unknown": that in which they span a person.
         rate: Frames a second, where a file does not say or says it wrongly.
@@ -83,11 +79,10 @@ def mosh_markers(markers: MarkersArg, output: Output, model: Models = (), layout
     """
     if not markers:
         raise ValueError("MARKERS: expected at least one file or folder")
-    held = tuple(label for words in hold_out for label in words.split(",") if label)
     if unlabelled and layout is None:
         raise UsageError("--unlabelled: expected --layout: which markers are worn, of scape layout list")
     units = resolve_marker_unit(markers, unit)
-    call = MoshCall(markers, model, layout, subject_prefix, held, retarget_to, units, rate, unlabelled, static, config)
+    call = MoshCall(markers, model, layout, subject_prefix, retarget_to, units, rate, unlabelled, static, config)
     with bar("people") as people, bar("one of them") as inside:
         return carry_out(call, space, workers, f"scape mosh {' '.join(sys.argv[2:])}", people, inside)
 
@@ -96,21 +91,21 @@ def carry_out(call: MoshCall, space: Workspace, workers: Workers, command: str, 
     """Run what has changed of a call in an open output; `tell` reports progress over people, and within one."""
     actors, loaded = call.actors(space.folder), call.models()
     work = MoshTask(loaded.neutral, loaded.name, loaded.sexes, loaded.character,
-                    None if call.layout is None else choose_layout(loaded.neutral, call.layout, ()), call.hold_out,
+                    None if call.layout is None else choose_layout(loaded.neutral, call.layout, ()),
                     call.unit, call.rate, call.unlabelled, call.static, call.config, command)
     # write the grouping to subjects.csv; one that the user edited stays, and has to be named with --subjects
     table = space.folder / TABLE
     if not table.exists() or space.is_ours(TABLE):
         with space.staging("people") as staged:
             write_grouping(staged.folder / TABLE, actors)
-    elif Grouping.of(call.subjects).table is not None:
+    elif subjects_table(call.subjects) is not None:
         warnings.warn(f"{table}: left as it was mended", stacklevel=2)
     else:
         raise ValueError(f"{table}: was mended; go by it with --subjects {table}, or move it away")
     # say who is who, for 20 people and 4 files of each
     for actor in actors[:20]:
         files, more = ", ".join(r.path.name for r in actor.recordings[:4]), len(actor.recordings) - 4
-        say(f"{actor.name}: {files}{f' and {more} more' if more > 0 else ''} ({actor.rule})")
+        say(f"{actor.name}: {files}{f' and {more} more' if more > 0 else ''}")
     if len(actors) > 20:
         say(f"and {len(actors) - 20} more people")
     # the work, then table, page and judgement
@@ -119,7 +114,7 @@ def carry_out(call: MoshCall, space: Workspace, workers: Workers, command: str, 
                       {name: line if line.startswith(f"{name}: ") else f"{name}: {line}"
                        for name, line in done.failures.items()}, done.fresh)
     lost = [f"{name}: {line}" for name, (_, failed) in done.values.items() for line in failed]
-    outcome = describe(call, loaded.name, actors).write(space, results, len(actors), lost)
+    outcome = describe(call, loaded.name).write(space, results, len(actors), lost)
     judged = [judgement_of(rows) for rows in results.values.values()]
     return replace(outcome, judgement=judged[0] if judged and len(actors) == 1 else outcome.judgement,
                    following=f"open {quote(str(space.folder / 'report.html'))}; "
@@ -127,17 +122,14 @@ def carry_out(call: MoshCall, space: Workspace, workers: Workers, command: str, 
                    f"or scape view --mend {quote(str(space.folder))} to correct markers")
 
 
-def describe(call: MoshCall, model: str, actors: Sequence[Actor]) -> FolderCommand:
+def describe(call: MoshCall, model: str) -> FolderCommand:
     """Return the wording of table and page for the people of a call; `model` is its name."""
-    rules = {actor.name: actor.rule for actor in actors}
-
     def lines(name: str, rows: Sequence[Metric]) -> list[str]:
-        shown = [as_line(m) for m in rows if m.name in (JUDGEMENT, *ERRORS, "sequences", "frames", "sex")]
-        return [*shown, f"recordings put together: {rules[name]}"]
+        return [as_line(m) for m in rows if m.name in (JUDGEMENT, *ERRORS, "sequences", "frames", "sex")]
 
     return FolderCommand(
         ("person", "people"), "{} from markers", _summary, lambda rows: figure(rows, FIXED),
-        {"mosh": call.config, "model": model, "layout": call.layout, "held out": call.hold_out}, lines,
+        {"mosh": call.config, "model": model, "layout": call.layout}, lines,
         "A marker that sits elsewhere than the layout has it, labels that are exchanged, a marker that should not be "
         "used: `scape view --mend FOLDER` puts them right and runs again.", call)
 

@@ -48,7 +48,7 @@ class Result:
         names = set(kept.list_results(""))
         actors = [actor for actor in call.actors(folder) if actor.name in names]
         rows = {actor.name: kept.value(actor.name)[0] for actor in actors}
-        order = describe(call, models.name, actors).worst_first(Results(rows, {}, ()), rows)
+        order = describe(call, models.name).worst_first(Results(rows, {}, ()), rows)
         people = load_people(folder, sorted(actors, key=lambda actor: order.index(actor.name)), models, call.unit,
                              call.rate)
         return Result(call, rows, people, _usual(call, models.neutral, people), models.neutral.template)

@@ -24,7 +24,7 @@ from ...motion import Motion, Progress
 from ..angle_conventions import AngleConfig, define_segments, find_landmarks
 from ..angle_errors import expect_angle_errors
 from ..artefacts.find import find_artefacts, no_artefacts, relabel_by_tracks
-from ..artefacts.results import ArtefactConfig, MarkerArtefacts
+from ..artefacts.results import MarkerArtefacts
 from ..files.markers import MarkerSequence
 from ..joint_angles import Known, angle_doubts, angle_table
 from ..marker_sets.layout import MarkerLayout
@@ -32,7 +32,7 @@ from ..movement import pace_doubts, posture_doubts
 from ..pose.coverage import Coverage, find_coverage, find_told_parts
 from ..pose.follow import animate
 from ..pose.judgement import judge_motions, motion_doubts, motion_problem
-from ..pose.marked_body import RATE, AnimateConfig
+from ..pose.marked_body import AnimateConfig
 from ..pose.pelvis import follow_pelvis
 from ..pose.witnesses import ask_witnesses, witness_doubts
 from ..soft_tissue.follow import SoftTissueConfig, follow_soft_tissue
@@ -47,23 +47,6 @@ UNLABELLED = Judgement()             # of labels that are those of the files
 
 
 @dataclass(frozen=True)
-class PoseConfig(AnimateConfig):
-    """Settings of the poses of a person with known shape and marker places: those of `animate`."""
-
-    @classmethod
-    def from_weights(cls, data: float, pose: float, velocity: float, outlier: float = 0.06) -> PoseConfig:
-        """Convert weights for squared centimetres, for the pose prior and for squared radians to settings.
-
-        A weight is an inverse variance. That of the change of velocity from frame to frame is meant for 120 frames per
-        second; at another rate it allows the same acceleration.
-
-        [MoSh] Eq. 17, Eq. 21, Eq. 22
-        """
-        return cls(marker_sd=0.01 * data**-0.5, prior_weight=pose, angle_acceleration=RATE**2 * velocity**-0.5,
-                   outlier=outlier)
-
-
-@dataclass(frozen=True)
 class MoshConfig(Settings):
     """Settings of `mosh`.
 
@@ -71,15 +54,13 @@ class MoshConfig(Settings):
     ----------
     person : PersonConfig
         Shape and marker places, from some frames.
-    poses : PoseConfig
+    poses : AnimateConfig
         Poses of all frames, with known shape and marker places. Markers are trusted more than in `animate`, whose
         layout may be inexact. In weights of the paper the markers have 2, the prior 0.3 and the change of velocity
         57600 instead of 0.75, 1 and 6.25. The prior of a few dozen scans is narrow and must not outweigh markers, and
         joints accelerate by 60 radians per second squared, not by 5760.
     soft : SoftTissueConfig
         Movement of the skin, or of the shape, over time.
-    artefacts : ArtefactConfig
-        Thresholds of marker artefacts.
     soft_tissue : bool
         Let the skin move on the body.
     repair : bool
@@ -98,9 +79,8 @@ class MoshConfig(Settings):
     """
 
     person: PersonConfig = field(default_factory=PersonConfig)
-    poses: PoseConfig = field(default_factory=lambda: PoseConfig.from_weights(2.0, 0.3, 57600.0))
+    poses: AnimateConfig = field(default_factory=lambda: AnimateConfig.from_weights(2.0, 0.3, 57600.0))
     soft: SoftTissueConfig = field(default_factory=SoftTissueConfig)
-    artefacts: ArtefactConfig = field(default_factory=ArtefactConfig)
     angles: AngleConfig = field(default_factory=AngleConfig)
     soft_tissue: bool = True
     repair: bool = True
@@ -114,8 +94,8 @@ class MoshConfig(Settings):
         first frame is found by a search, then all frames are solved together, by Gauss-Newton. The weight of the
         velocity is meant for 120 frames a second, and scaled for other rates.
         """
-        poses = replace(PoseConfig.from_weights(0.75, 1.0, 6.25, outlier=1000.0), place_acceleration=1e6,
-                        prior_shrinkage=0.0)
+        # 1000 metres: no marker is an outlier
+        poses = replace(AnimateConfig.from_weights(0.75, 1.0, 6.25), outlier=1000.0, published=True)
         return cls(PersonConfig.from_paper(), poses, SoftTissueConfig.from_paper(), repair=False)
 
 
@@ -439,51 +419,28 @@ class _Stages:
         if not self.config.repair:
             trial.artefacts = no_artefacts(person.subject, markers, fit.layout, motion)
             return
-        bad = self.config.artefacts
         trial.artefacts = self.run(
-            "artefacts", name, (self.model, fit.betas, fit.layout, markers, motion, bad, known),
-            lambda report_progress: find_artefacts(person.subject, markers, fit.layout, bad, motion, report_progress,
+            "artefacts", name, (self.model, fit.betas, fit.layout, markers, motion, known),
+            lambda report_progress: find_artefacts(person.subject, markers, fit.layout, motion, report_progress,
                                                    known), known is None)
         trial.markers = trial.artefacts.repaired
 
     def find_soft_tissue(self, trial: _Trial, person: _Person) -> None:
         """Estimate the movement of the skin, or of the shape."""
         model, layout, markers, motion = self.model, person.fit.layout, trial.markers, trial.motion
-        soft, ground, floor = self.config.soft, self.config.poses.ground, self.config.poses.floor
+        soft, ground = self.config.soft, self.config.poses.ground
         assert motion is not None, "followed"
         trial.soft = self.run(
-            "soft tissue", f"soft tissue {trial.number}", (model, layout, markers, motion, soft, ground, floor),
-            lambda report_progress: follow_soft_tissue(model, motion, markers, layout, soft, report_progress, ground,
-                                                       floor), True)
-
-
-@dataclass(frozen=True, eq=False)
-class SexedMosh:
-    """Shape and motions of a person with the model of their sex.
-
-    Attributes
-    ----------
-    guess : SexGuess
-        The sex that the markers suggest.
-    model : BodyModel
-        The model of that sex.
-    neutral : PersonFit
-        The person with the neutral model, which gave the guess.
-    result : MoshResult
-        With the model of that sex; the motions have it as their gender.
-    """
-
-    guess: SexGuess
-    model: BodyModel
-    neutral: PersonFit
-    result: MoshResult
+            "soft tissue", f"soft tissue {trial.number}", (model, layout, markers, motion, soft, ground),
+            lambda report_progress: follow_soft_tissue(model, motion, markers, layout, soft, report_progress, ground),
+            True)
 
 
 @one_thread()
 def mosh_by_sex(models: Mapping[str, BodyModel], sequences: MarkerSequence | Sequence[MarkerSequence],
                 layout: MarkerLayout, config: MoshConfig | None = None, progress: Progress | None = None,
-                step: Step = run_uncached) -> SexedMosh:
-    """Run `mosh` with the model of the person's sex.
+                step: Step = run_uncached) -> tuple[SexGuess, MoshResult]:
+    """Run `mosh` with the model of the person's sex; return the guess, and the result, whose motions name the sex.
 
     The neutral model finds a body, its betas suggest the sex, and `mosh` runs with the model of that sex.
 
@@ -508,7 +465,7 @@ def mosh_by_sex(models: Mapping[str, BodyModel], sequences: MarkerSequence | Seq
     result = mosh(sequences, models[guess.sex], layout, config, progress, step)
     motions = tuple(replace(motion, gender=guess.sex) for motion in result.motions)
     soft = tuple(replace(one, motion=replace(one.motion, gender=guess.sex)) for one in result.soft_tissue)
-    return SexedMosh(guess, models[guess.sex], neutral, replace(result, motions=motions, soft_tissue=soft))
+    return guess, replace(result, motions=motions, soft_tissue=soft)
 
 
 def check_models(models: Mapping[str, BodyModel]) -> None:

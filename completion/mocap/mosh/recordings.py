@@ -3,9 +3,8 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal, cast, get_args
 
 from scanprep.arguments import UsageError
 from scanprep.batch.workspace import HOME
@@ -15,7 +14,6 @@ from scanprep.words import check_names, fold_name
 from ..files.markers import READERS, label_prefixes, marker_subjects
 from ..files.text import MarkerFileError
 
-By = Literal["auto", "name", "label", "each", "all"]
 TABLE = "subjects.csv"
 
 
@@ -30,82 +28,65 @@ class Recording:
 
 @dataclass(frozen=True)
 class Actor:
-    """A person: a name fit for a folder, its recordings, and the rule that grouped them."""
+    """A person: a name fit for a folder, and its recordings."""
 
     name: str
     recordings: tuple[Recording, ...]
-    rule: str = field(metadata={"digest": False})
 
 
-@dataclass(frozen=True)
-class Grouping:
-    """How recordings are assigned to people: by a rule, see --subjects of `scape mosh`, or by a table.
+def subjects_table(subjects: str) -> Path | None:
+    """Return the table that a value of --subjects names; None for "auto", or for what stands before labels."""
+    if Path(subjects).suffix.lower() in (".csv", ".json"):
+        return Path(subjects)
+    if Path(subjects).suffix or "/" in subjects:
+        raise UsageError(f"--subjects: expected a file .csv or .json, or what stands before the colon of labels, got "
+                         f"'{subjects}'")
+    return None
 
-    "auto" means "all" for files that were named. In a folder it goes by sub-folder. For files side by side it is "name"
-    where the name is two numbers, such as 85_02, else "label", else "each". Several people in one file are always kept
-    apart by their labels.
+
+def find_actors(markers: Iterable[Path], subjects: str = "auto", output: Path | None = None) -> list[Actor]:
+    """Find the people of some files and folders, outside `output`; ValueError where there is none.
+
+    Files that were named are of one person, and so is a sub-folder of a folder; a file that lies beside others in a
+    folder is of a person by itself. Several people in one file are always kept apart by their labels. `subjects` is a
+    table of files and subjects, .csv or .json, or what stands before the labels of one person.
     """
-
-    by: By = "auto"
-    table: Path | None = None            # CSV with the columns file and subject, or JSON {file: subject}
-    who: str | None = None               # prefix of the labels to read, in files with several people
-
-    @staticmethod
-    def of(subjects: str) -> Grouping:
-        """Parse the value of --subjects: a rule, a table, or a prefix of labels."""
-        if subjects in get_args(By):
-            return Grouping(cast(By, subjects))
-        if Path(subjects).suffix.lower() in (".csv", ".json"):
-            return Grouping("auto", Path(subjects))
-        if Path(subjects).suffix or "/" in subjects:
-            raise UsageError(f"--subjects: expected a file .csv or .json, one of {', '.join(get_args(By))}, or what "
-                             f"stands before the colon of labels, got '{subjects}'")
-        return Grouping("auto", None, subjects)
-
-
-def find_actors(markers: Iterable[Path], grouping: Grouping, output: Path | None = None) -> list[Actor]:
-    """Find the people of some files and folders, outside `output`; ValueError where there is none."""
-    sources = list(markers)
+    sources, table = list(markers), subjects_table(subjects)
+    prefix = None if table is not None or subjects == "auto" else subjects
     for place in sources:
         if output is not None and place.is_dir() and output.resolve() in (place.resolve(), *place.resolve().parents):
             raise ValueError(f"{output}: expected a folder for the output that does not hold the recordings, {place}")
-    files = list(_files(sources, output, grouping))
+    files = list(_files(sources, output, table, prefix))
     # a named prefix has to occur
-    if grouping.who is not None and files:
+    if prefix is not None and files:
         prefixes = set().union(*(label_prefixes(file.path) for file in files))
-        if not prefixes & set(grouping.who.split(",")):
-            raise UsageError(f"--subjects: expected a file .csv or .json, one of {', '.join(get_args(By))}, or what "
-                             f"stands before the colon of labels ({', '.join(sorted(prefixes)) or 'here: none'}), "
-                             f"got '{grouping.who}'")
+        if not prefixes & set(prefix.split(",")):
+            raise UsageError("--subjects: expected a file .csv or .json, or what stands before the colon of labels "
+                             f"({', '.join(sorted(prefixes)) or 'here: none'}), got '{prefix}'")
     if not files:
         raise ValueError(f"{', '.join(map(str, sources))}: expected files ending in {', '.join(READERS)}, found none")
-    # rows of person, file, prefix and rule: by the table, all together, or file by file
-    whole = grouping.by == "all" or (grouping.by == "auto" and all(path.is_file() for path in sources)
-                                     and not any(len(f.people) > 1 for f in files))
-    if grouping.table is not None:
-        subject_of = _read_table(grouping.table, [f.path for f in files])
+    # rows of person, file and prefix: by the table, all together, or file by file
+    if table is not None:
+        subject_of = _read_table(table, [f.path for f in files])
         rows = []
         for f, subject in [(file, subject) for file in files for subject in subject_of.get(file.path, ())]:
             # in a file with several people, the one whom the table names
             named = (who for who in f.people if folder_name(who) == folder_name(subject))
-            who = grouping.who or (next(named, None) if len(f.people) > 1 else None)
-            rows.append((folder_name(subject), f, who, f"as {grouping.table} says"))
-    elif whole:
-        name = next(_people(files[0], grouping))[0]
-        if len(sources) == 1 and sources[0].is_dir():
-            name = sources[0].resolve().name
-        rows = [(folder_name(name), f, grouping.who, "files that were named together") for f in files]
+            who = next(named, None) if len(f.people) > 1 else None
+            rows.append((folder_name(subject), f, who))
+    elif all(path.is_file() for path in sources) and not any(len(f.people) > 1 for f in files):
+        name = folder_name(prefix or files[0].path.stem)
+        rows = [(name, f, prefix) for f in files]
     else:
-        rows = [(folder_name(name), f, who, rule) for f in files for name, who, rule in _people(f, grouping)]
-    return [Actor(person, _name_recordings(person, [(f, who) for name, f, who, _ in rows if name == person]),
-                  next(rule for name, *_, rule in rows if name == person))
+        rows = [(folder_name(name), f, who) for f in files for name, who in _people(f, prefix)]
+    return [Actor(person, _name_recordings(person, [(f, who) for name, f, who in rows if name == person]))
             for person in sorted({name for name, *_ in rows})]
 
 
 def write_grouping(path: Path, actors: Iterable[Actor]) -> None:
-    """Write the people and their files as CSV, in the form that `Grouping.table` takes."""
-    tables.write_table(path, ("file", "subject", "rule"),
-                       ((r.path, actor.name, actor.rule) for actor in actors for r in actor.recordings))
+    """Write the people and their files as CSV, in the form that --subjects takes."""
+    tables.write_table(path, ("file", "subject"),
+                       ((r.path, actor.name) for actor in actors for r in actor.recordings))
 
 
 def folder_name(text: str) -> str:
@@ -122,16 +103,16 @@ class _File:
     people: tuple[str, ...]              # empty where a prefix was named
 
 
-def _files(sources: list[Path], output: Path | None, grouping: Grouping) -> Iterator[_File]:
+def _files(sources: list[Path], output: Path | None, table: Path | None, prefix: str | None) -> Iterator[_File]:
     """Yield the files that were named and the marker files of named folders, each once."""
-    seen = set() if grouping.table is None else {grouping.table.resolve()}
+    seen = set() if table is None else {table.resolve()}
     outputs = {output.resolve()} if output is not None else set()
     for place in sources:
         if not place.exists():
             raise ValueError(f"{place}: no such file or folder")
         if place.is_dir():                             # outputs of earlier calls are no recordings
-            outputs |= {table.parent.resolve() for table in place.rglob(TABLE)
-                        if (table.parent / "report.html").exists() or (table.parent / HOME).exists()}
+            outputs |= {made.parent.resolve() for made in place.rglob(TABLE)
+                        if (made.parent / "report.html").exists() or (made.parent / HOME).exists()}
         for path in sorted(place.rglob("*")) if place.is_dir() else [place]:
             parts, whole = path.relative_to(place).parts, path.resolve()
             if place.is_dir() and (path.suffix.lower() not in READERS or any(part.startswith(".") for part in parts)
@@ -140,27 +121,19 @@ def _files(sources: list[Path], output: Path | None, grouping: Grouping) -> Iter
             if whole not in seen:
                 seen.add(whole)
                 try:
-                    people = marker_subjects(path) if grouping.who is None else ()
+                    people = marker_subjects(path) if prefix is None else ()
                 except MarkerFileError:  # reported when the file is read as a whole
                     people = ()
                 yield _File(path, parts[:-1], people)
 
 
-def _people(file: _File, grouping: Grouping) -> Iterator[tuple[str, str | None, str]]:
-    """Yield name, prefix of labels and rule for the people in a file."""
-    by, stem = grouping.by, file.path.stem
-    numbers, people = re.fullmatch(r"(\d+)[_-]\d+", stem), file.people
-    if len(people) > 1:
-        for who in people:
-            yield who, who, "by what stands before the labels"
-    elif by == "auto" and file.folders:
-        yield file.folders[0], grouping.who, "by the sub-folder"
-    elif by == "name" or (by == "auto" and numbers):
-        yield re.split(r"[_\-\s]", stem)[0], grouping.who, "by the file name" + (", NUMBER_NUMBER" if numbers else "")
-    elif by != "each" and people:
-        yield people[0], None, "by what stands before the labels"
+def _people(file: _File, prefix: str | None) -> Iterator[tuple[str, str | None]]:
+    """Yield name and prefix of labels for the people in a file of a folder."""
+    if len(file.people) > 1:
+        for who in file.people:
+            yield who, who
     else:
-        yield stem if grouping.who is None or by == "each" else grouping.who, grouping.who, "a file by itself"
+        yield file.folders[0] if file.folders else prefix or file.path.stem, prefix
 
 
 def _name_recordings(person: str, files: list[tuple[_File, str | None]]) -> tuple[Recording, ...]:

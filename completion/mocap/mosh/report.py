@@ -1,11 +1,7 @@
 """Report pages of `scape mosh`: one for a person, one for each sequence."""
 from __future__ import annotations
 
-import io
-import json
 from collections.abc import Mapping, Sequence
-from html import escape
-from typing import Any
 
 import numpy as np
 
@@ -13,25 +9,25 @@ from model.body import BodyModel
 from scanprep.cli import MM
 from scanprep.console import Metric
 from scanprep.folders import add_entry, as_line
-from scanprep.geometry import storage
 from scanprep.geometry.farthest_points import spread_indices
 from scanprep.pictures.page import Page
-from scanprep.pictures.scene import Pane
-from scanprep.pictures.shading import Dots
+from scanprep.pictures.scene import picture_pane
+from scanprep.pictures.shading import contact_sheet
 from scanprep.pictures.sheets import webp_bytes
 
-from ...motion_pictures import MARKER, facing, marker_rows, mean_over, upwards, worst_frames
+from ...motion_pictures import marker_rows, mean_over, worst_frames
+from ..files.force_plates import GroundReactions
+from ..gait.cycles import GaitCycles
 from ..gait.pictures import chart_cycles, chart_forces
 from ..marker_sets.layout import MarkerLayout
 from . import pictures
 from .mosh import MoshResult
-from .pictures import chart_artefacts, chart_frames, chart_map, chart_timeline
-from .takes import Take, Walk
+from .pictures import chart_frames, chart_timeline
+from .takes import Take
 
 
 def person_page(name: str, model: BodyModel, result: MoshResult, usual: MarkerLayout, takes: Sequence[Take],
-                metrics: Sequence[Metric], figures: Mapping[str, Sequence[Metric]], settings: Mapping[str, Any]
-                ) -> Page:
+                metrics: Sequence[Metric], figures: Mapping[str, Sequence[Metric]]) -> Page:
     """Make the page of a person: shape, markers before and after, links to its sequences and their figures."""
     body, labels, misplaced = pictures.person_in_mean_pose(model, result.betas), result.layout.labels, result.misplaced
     before = usual.select(labels)
@@ -75,48 +71,40 @@ def person_page(name: str, model: BodyModel, result: MoshResult, usual: MarkerLa
                 "found (mm)", "distance left, fixed shape (mm)"))
     if before.loose:
         page.text(f"Loose markers, which may sit anywhere on their limb: {', '.join(before.loose)}.")
-    page.section("Frames that shape and markers were found from")
-    page.bodies(_choose_frames(result, takes), height=200)
-    return closing(page, metrics, settings)
+    return page.section("Figures").figures(metrics)
 
 
-def take_page(take: Take, metrics: Sequence[Metric], picture: np.ndarray, walk: Walk) -> Page:
-    """Make the page of a sequence: motion, gait, distances of markers, soft tissue, artefacts; `closing` ends it."""
-    motion, held, artefacts = take.motion, take.held, take.artefacts
-    # 56 frames in which soft tissue is measured
-    frames = spread_indices(len(take.shown.poses), 56)
+def take_page(take: Take, metrics: Sequence[Metric], picture: np.ndarray, gait: GaitCycles | None,
+              reactions: GroundReactions | None) -> Page:
+    """Make the page of a sequence without its end: motion, gait, distances of markers, soft tissue, artefacts."""
+    motion, artefacts = take.motion, take.artefacts
     page = Page(f"{take.name}, with {'soft tissue' if take.soft else 'fixed shape'}",
                 "Dots are the measured markers: red where they are believed, orange where they are seen but not "
-                "believed, green for held-out markers, which no stage has seen.")
+                "believed.")
     page.table([(m.name, m.text(), m.unit) for m in _main(metrics)])
     page.section("The whole sequence").bodies(
         [pictures.take_pane(take)], "Press the triangle to play, drag the body to turn it; it is kept in the middle.",
         520, webp_bytes(picture))
-    _show_walk(page, walk)
+    show_walk(page, gait, reactions)
     page.section("Distance of the markers", "From where the body has them to where they were measured.")
     page.chart(chart_frames(take), "mean of the markers, over time")
-    page.chart(chart_map(take), "every marker over time, the worst first; white where it was not seen, or taken out "
-                                "as bad")
     page.bodies(pictures.take_frame_panes(take, worst_frames(take.shown, 5)), "the frames in which they are farthest",
                 300)
-    # a table of markers, the worst first, held-out ones on top
+    # a table of markers, the worst first
     rows = marker_rows(motion.labels, motion.residuals, None if take.soft is None else take.soft.motion.residuals,
                        motion.trusted)
-    if held is not None:
-        rows = marker_rows([f"{label} (held out)" for label in held.labels], held.fixed, held.soft, None) + rows
     page.table(rows, ("marker", "fixed shape (mm)", "soft tissue (mm)", "95th percentile (mm)", "seen (%)",
                       "believed (%)"))
     used = np.isfinite(motion.residuals).any(axis=0)
-    unused = [label for label, is_used in zip(motion.labels, used, strict=True)
-              if not is_used and (held is None or label not in held.labels)]
+    unused = [label for label, is_used in zip(motion.labels, used, strict=True) if not is_used]
     if unused:
         page.text(f"Not used, because the layout does not know them or they were never seen: {', '.join(unused)}.")
     if take.soft is not None:
         page.section("Soft tissue", "The skin may move in every frame, as flesh does and as a pose model with one "
                      "fixed shape cannot. What it takes up may also be markers that slide with the skin.")
+        # over 56 frames
+        frames = spread_indices(len(take.shown.poses), 56)
         page.bodies([pictures.soft_pane(take, frames)], "where the body changes most")
-        page.bodies(pictures.soft_tissue_panes(take, pictures.most_changed(take, frames, 4)),
-                    "frames that change most", 300)
     page.section("Marker artefacts", "The body says where each marker should be: one that is elsewhere was "
                  "swapped with another, has slipped, jitters or strays.")
     # a table of artefacts, in order of time
@@ -129,36 +117,23 @@ def take_page(take: Take, metrics: Sequence[Metric], picture: np.ndarray, walk: 
                    ("artefact", "marker", "first frame", "last frame", "lasts (s)", "distance (mm)"))
     else:
         page.text("None was found.")
-    page.chart(chart_timeline(take), "every marker over time")
-    if not artefacts.labels_touched.isdisjoint(artefacts.labels):
-        out = io.BytesIO()                          # as pixels: as lines it would grow with the sequence
-        chart_artefacts(artefacts, take.markers).savefig(out, format="png", dpi=130)
-        page.picture(out.getvalue(), "these markers: how far they were from where the body has them, and what is left "
-                     "of it")
-    return page
+    return page.chart(chart_timeline(take), "every marker over time")
 
 
-def _show_walk(page: Page, walk: Walk) -> None:
+def show_walk(page: Page, gait: GaitCycles | None, reactions: GroundReactions | None) -> None:
     """Add joint angles over the gait cycle, and forces of the force plates, where there are any."""
-    if walk.gait is not None:
-        gait, sides = walk.gait, walk.gait.events.cycles
+    if gait is not None:
+        sides = gait.events.cycles
         page.section("Gait", f"{len(sides['l'])} left and {len(sides['r'])} right gait cycles, "
                      f"{gait.events.cadence:.0f} steps a minute. Foot strikes and foot offs are from: "
                      f"{gait.events.source}. All angles are in gait_cycles.csv.")
         page.chart(chart_cycles(gait), "joint angles from foot strike to the next strike of the same foot; the pelvis "
                                        "is measured from the way of walking, once over left and once over right cycles")
-    if walk.reactions is not None:
+    if reactions is not None:
         page.section("Force plates", "Forces of the ground on the person, in grf.mot for OpenSim.")
-        page.chart(chart_forces(walk.reactions), "vertical force over time")
-        for note in walk.reactions.notes:
+        page.chart(chart_forces(reactions), "vertical force over time")
+        for note in reactions.notes:
             page.text(f"{note[0].upper()}{note[1:]}.")
-
-
-def closing(page: Page, metrics: Sequence[Metric], settings: Mapping[str, Any]) -> Page:
-    """End a page with all figures and settings."""
-    page.section("Figures").figures(metrics)
-    text = escape(json.dumps(storage.as_json(settings), indent=1))
-    return page.markup(f"<details><summary>All settings</summary><pre><code>{text}</code></pre></details>")
 
 
 def person_picture(model: BodyModel, result: MoshResult) -> np.ndarray:
@@ -167,23 +142,11 @@ def person_picture(model: BodyModel, result: MoshResult) -> np.ndarray:
     return pictures.picture_sides(body, result.layout.place(body))
 
 
-def take_picture(take: Take, count: int = 6) -> np.ndarray:
-    """Render some frames of a sequence, for the page of its person."""
-    frames = np.unique(np.linspace(0, len(take.motion.poses) - 1, count + 2).round().astype(int)[1:-1])
-    return pictures.picture_large(take, frames, 260)
-
-
-def _choose_frames(result: MoshResult, takes: Sequence[Take]) -> list[Pane]:
-    """Return the frames of the person's fit, each with its body and markers."""
-    person, subject, light = result.person, takes[0].subject, takes[0].light
-    panes, vertical = [], upwards(takes[0].shown, subject)
-    for (number, t), pose, trans in zip(person.frames.tolist(), person.poses, person.trans, strict=True):
-        vertices, markers = subject.vertices(pose, trans).astype(float), takes[number].markers
-        known = result.layout.match_labels(markers.labels, 0)
-        dots = Dots(markers.select([label for label in markers.labels if label in known]).positions[t], MARKER, 0.015)
-        panes.append(Pane([light.mesh(vertices), dots], facing(subject, pose, vertices, vertical=vertical),
-                          str(t) if len(takes) == 1 else f"{number + 1}: {t}"))
-    return panes
+def take_picture(take: Take) -> np.ndarray:
+    """Render six frames of a sequence, for the page of its person."""
+    frames = np.unique(np.linspace(0, len(take.motion.poses) - 1, 8).round().astype(int)[1:-1])
+    panes = pictures.take_frame_panes(take, frames)
+    return contact_sheet([picture_pane(pane, 161, 260) for pane in panes], [pane.label for pane in panes])
 
 
 def _main(metrics: Sequence[Metric]) -> list[Metric]:

@@ -7,41 +7,14 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from model.body import BodyModel
-from model.fitting.energy import rise_above_skin
 from model.linear import Subject
 
 from ...motion import Motion
 from ...motion_pictures import LightMesh
 from ..artefacts.results import MarkerArtefacts
-from ..files.force_plates import GroundReactions
 from ..files.markers import MarkerSequence
-from ..gait.cycles import GaitCycles
-from ..marker_sets.layout import MarkerLayout
-from ..pose.marked_body import supports
 from ..soft_tissue.soft_tissue import SoftTissue
 from .recordings import Recording
-
-
-@dataclass(frozen=True, eq=False)
-class HeldOut:
-    """Distances (T, H), metres, of the body from held-out markers; `soft` with soft tissue, if any."""
-
-    labels: tuple[str, ...]
-    fixed: np.ndarray
-    soft: np.ndarray | None
-
-    @property
-    def shown(self) -> np.ndarray:
-        """Distances (T, H) with soft tissue where there is one."""
-        return self.fixed if self.soft is None else self.soft
-
-
-@dataclass(frozen=True, eq=False)
-class Walk:
-    """What a gait laboratory reads of a sequence: gait cycles of somebody who walks, forces of force plates."""
-
-    gait: GaitCycles | None
-    reactions: GroundReactions | None
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,7 +29,6 @@ class Take:
     motion: Motion
     soft: SoftTissue | None
     artefacts: MarkerArtefacts
-    held: HeldOut | None
     light: LightMesh
     _kept: dict[int, np.ndarray] = field(default_factory=dict)
 
@@ -84,24 +56,3 @@ class Take:
     def rigid(self, frames: Sequence[int] | np.ndarray) -> np.ndarray:
         """Compute meshes (n, N, 3) of the same poses with the person's own shape, metres."""
         return self.shown.vertices(self.subject, np.asarray(frames)).astype(float)
-
-
-def measure_held_out(model: BodyModel, layout: MarkerLayout, labels: Sequence[str], markers: MarkerSequence,
-                     motion: Motion,
-                     soft: SoftTissue | None) -> HeldOut | None:
-    """Measure the distance of a motion from held-out markers of the layout; None where there are none."""
-    wanted = {layout.aliases.get(label, label) for label in labels}
-    known = layout.match_labels(markers.labels, 0)
-    names = tuple(label for label in known if layout.aliases.get(label, label) in wanted)
-    if not names:
-        return None
-    # simulated markers of the layout's places on the fixed shape, then with soft tissue
-    places = layout.select(names)
-    ids, weights = supports(model.template, places)
-    lift, seen = np.asarray(places.distances), markers.select(names).positions
-    assert motion.betas is not None, "a person of a shape space"
-    points = model.points(ids, weights, len(motion.betas)).operator(motion.betas)
-    fixed = np.linalg.norm(rise_above_skin(points.evaluate(motion.poses, motion.trans), lift) - seen, axis=2)
-    if soft is None:
-        return HeldOut(names, fixed, None)
-    return HeldOut(names, fixed, np.linalg.norm(rise_above_skin(soft.points(model, ids, weights), lift) - seen, axis=2))

@@ -5,7 +5,7 @@ import time
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property, partial
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -15,8 +15,6 @@ from model.body import BodyModel
 from model.learning.sexes import SexGuess
 from model.linear import Subject
 from model.motion.files import skeleton_arrays
-from model.people import person_judgement
-from scanprep.arguments import UsageError
 from scanprep.batch.room import TaskContext
 from scanprep.cli import MM
 from scanprep.console import Metric, Outcome, details, judgement_row, write_report
@@ -31,11 +29,11 @@ from ...motion_pictures import picture_bodies
 from ..angle_conventions import define_segments
 from ..angle_errors import expect_angle_errors
 from ..artefacts.results import artefact_table, write_virtual
-from ..files.force_plates import read_ground_reactions, write_ground_reactions
+from ..files.force_plates import GroundReactions, read_ground_reactions, write_ground_reactions
 from ..files.markers import MarkerSequence, read_markers
 from ..files.motion_files import joint_centres, write_glb, write_motion_folder, write_residuals
 from ..files.opensim import centre_sequence, mask_unknown_centres
-from ..gait.cycles import average_cycles, write_gait
+from ..gait.cycles import GaitCycles, average_cycles, write_gait
 from ..gait.events import find_gait_events
 from ..joint_angles import (
     NOTHING_KNOWN,
@@ -48,23 +46,21 @@ from ..joint_angles import (
 from ..labelling.labelled_file import label_first, show_labels
 from ..marker_sets.layout import MarkerLayout
 from ..marker_sets.named import choose_layout
-from ..pose.coverage import Coverage, find_told_parts, untold_spans
+from ..pose.coverage import find_told_parts, untold_spans
 from ..pose.follow import animate
 from ..pose.judgement import markers_told
 from ..pose.pelvis import follow_pelvis
-from ..pose.witnesses import ask_witnesses
 from ..retargeting.retarget import retarget
 from ..retargeting.soft_tissue import picture_transfer, retarget_soft_tissue, write_character
 from .mosh import MoshConfig, MoshResult, clocks, mosh, mosh_by_sex
 from .pictures import person_in_mean_pose
 from .recordings import Actor, Recording
-from .report import closing, person_page, person_picture, take_page, take_picture
-from .takes import LightMesh, Take, Walk, measure_held_out
+from .report import person_page, person_picture, take_page, take_picture
+from .takes import LightMesh, Take
 
-# held-out errors first; what is left after soft tissue was fitted to the same markers is small, and no error
-ERRORS = ("held-out error, fixed shape", "held-out error, soft tissue", "markers to the body, fixed shape",
-          "left over after soft tissue was fitted")
-FIXED = ERRORS[2]                    # the one that every person has
+# what is left after soft tissue was fitted to the same markers is small, and no error
+FIXED = "markers to the body, fixed shape"
+ERRORS = (FIXED, "left over after soft tissue was fitted")
 # metres: markers of a person are 5 to 15 mm off in another recording of the same session; and degrees from upright
 SOMEBODY_ELSE, STANDING = 0.025, {"hip_flexion": 35, "hip_adduction": 25, "knee_angle": 30, "ankle_angle": 35}
 HALF = 100                           # steps of progress for shape and motion, and as many for files and pictures
@@ -79,7 +75,6 @@ class MoshTask:
     sexes: Mapping[str, BodyModel]       # models of "female" and "male" people, or empty
     character: BodyModel | None
     layout: tuple[MarkerLayout, str] | None          # with its name; None for the named one that fits labels best
-    hold_out: tuple[str, ...]            # labels of held-out markers
     unit: str | None
     rate: float | None                   # frames a second, where a file does not say
     unlabelled: bool                     # markers have no names
@@ -95,12 +90,12 @@ class MoshTask:
         start, folder = clocks(), context.folder
         outcome, failures = _solve(self, actor, context)
         solved = clocks() - start
-        settings = {"mosh": self.config, "model": self.name, "layout": outcome.layout_name, "held out": self.hold_out}
+        settings = {"mosh": self.config, "model": self.name, "layout": outcome.layout_name}
         # the person: betas and how they were found, where the markers sat
         result, person = outcome.result, outcome.result.person
         storage.write_json(folder / "subject.json", {
             "betas": result.betas.tolist(), "model": self.name, "layout": outcome.layout_name,
-            "held_out": self.hold_out, "sex": outcome.guess, "recordings": [r.path.name for r in actor.recordings],
+            "sex": outcome.guess, "recordings": [r.path.name for r in actor.recordings],
             "frames": person.frames.tolist(),
             "moved": dict(zip(result.layout.labels, person.moved.tolist(), strict=True)),
             "misplaced": {m.label: {"from_the_layout": m.before, "left": m.after} for m in result.misplaced.moved},
@@ -120,8 +115,8 @@ class MoshTask:
         judgement = outcome.judgement(outcome.takes)
         metrics = [judgement_row(judgement), Metric("model", self.name), *_person_metrics(outcome),
                    *_figures(outcome.takes)]
-        person_page(actor.name, outcome.model, result, outcome.usual, outcome.takes, metrics, figures,
-                    settings).write(folder / "report.html")
+        person_page(actor.name, outcome.model, result, outcome.usual, outcome.takes, metrics, figures
+                    ).write(folder / "report.html")
         save_png(folder / PICTURE, person_picture(outcome.model, result))
         pages += clocks()
         # run times of the stages, including kept ones; not on the page, which must not change from run to run
@@ -151,23 +146,9 @@ class _Found:
     segments: SegmentAxes | None         # by another convention than the usual ISB
     zero: Mapping[str, np.ndarray] | None        # of joint angles, from a static trial
 
-    @cached_property
-    def person(self) -> Judgement:
-        """Judgement of the body: whether a person can have it."""
-        return person_judgement(self.model, self.result.betas)
-
-    @property
-    def covered(self) -> Coverage:
-        """Which parts of the body the markers of all sequences determine."""
-        return self.result.covered
-
     def told(self, take: Take) -> np.ndarray:
         """Find in which frames the markers determine which parts, (T, J) bool."""
         return find_told_parts(take.subject, self.result.layout, take.motion)
-
-    def ask_witnesses(self, take: Take) -> dict[str, float]:
-        """Compute how far the unused markers of a sequence are from the body, metres."""
-        return ask_witnesses(take.motion, take.subject, take.markers, self.covered.used)
 
     def find_known(self, take: Take) -> Known:
         """Find what is known of the joint angles of a sequence."""
@@ -206,33 +187,27 @@ def _solve(work: MoshTask, actor: Actor, context: TaskContext) -> tuple[_Found, 
             failures.append(" ".join(str(error).split()))
     if not sequences:
         raise ValueError("; ".join(failures))
-    # the layout for these labels, without held-out markers
+    # the layout for these labels
     labels = tuple(dict.fromkeys(label for each in sequences for label in each.labels))
     usual, layout_name = work.layout or choose_layout(work.model, None, labels)
     usual = usual.with_spellings(labels)
-    try:
-        layout = usual.without(work.hold_out) if work.hold_out else usual
-    except ValueError as error:
-        raise UsageError(f"--hold-out: {error}") from None
     model, guess = work.model, None
 
     def progress(done: int, total: int) -> None:
         context.report_progress(HALF * done // total, 2 * HALF)
 
     if work.sexes:
-        by_sex = mosh_by_sex({"neutral": work.model, **work.sexes}, sequences, layout, work.config, progress,
-                             context.step)
-        model, guess, result = by_sex.model, by_sex.guess, by_sex.result
+        guess, result = mosh_by_sex({"neutral": work.model, **work.sexes}, sequences, usual, work.config, progress,
+                                    context.step)
+        model = result.model
     else:
-        result = mosh(sequences, model, layout, work.config, progress, context.step)
-    # a take for each sequence, with distances from held-out markers
+        result = mosh(sequences, model, usual, work.config, progress, context.step)
+    # a take for each sequence
     subject = model.subject(result.betas)
     light, takes = LightMesh.of(model.template), []
     for i, (source, unit, markers) in enumerate(zip(recordings, units, sequences, strict=True)):
         soft = result.soft_tissue[i] if result.soft_tissue else None
-        held = measure_held_out(model, usual, work.hold_out, markers, result.motions[i], soft)
-        takes.append(Take(source, unit, model, subject, markers, result.motions[i], soft, result.artefacts[i],
-                          held, light))
+        takes.append(Take(source, unit, model, subject, markers, result.motions[i], soft, result.artefacts[i], light))
     segments = define_segments(work.config.angles, model, subject, result.layout)
     zero, doubts = _stand(work, subject, result.layout, segments) if work.static else (None, Judgement())
     return _Found(model, guess, result, takes, usual, layout_name, Judgement().merge(*labelling, doubts), segments,
@@ -263,7 +238,7 @@ def _write(work: MoshTask, found: _Found, take: Take, context: TaskContext, sett
            ) -> tuple[list[Metric], np.ndarray]:
     """Write a sequence into its folder, in steps that are kept; return figures and times (2,) of the page, seconds."""
     metrics, factor = [Metric("layout", found.layout_name), *_figures([take])], work.config.exaggeration
-    solved = found.model, take.markers, take.motion, take.soft, take.artefacts, take.held
+    solved = found.model, take.markers, take.motion, take.soft, take.artefacts
 
     def place(folder: Path) -> Path:
         (folder / take.name).mkdir(exist_ok=True)
@@ -272,25 +247,23 @@ def _write(work: MoshTask, found: _Found, take: Take, context: TaskContext, sett
     def page(folder: Path) -> None:
         start = time.perf_counter()
         picture = take_picture(take)
-        page = take_page(take, metrics, picture, walk)
+        page = take_page(take, metrics, picture, gait, reactions)
         if shown:
             page.section("On a character", "The same rotations of the joints, and feet on the ground when those of the "
                          f"person are; soft tissue taken {factor:g} times.").picture(*shown)
         if work.unlabelled:
             show_labels(page)
-        closing(page, metrics, settings).write(place(folder) / "report.html")
+        page.section("Figures").figures(metrics).write(place(folder) / "report.html")
         save_png(place(folder) / PICTURE, picture)
         judgement = found.judgement([take])
         outcome = Outcome(place(folder), metrics, settings, judgement=judgement)
         write_report(outcome, work.command, time.perf_counter() - start)
 
     metrics += untold_spans(take.subject.skeleton, found.told(take), take.motion.rate)
-    if witnesses := list(found.ask_witnesses(take).items())[:3]:
-        farthest = ", ".join(f"{label} {MM * off:.0f} mm" for label, off in witnesses)
-        metrics.append(Metric("markers not used, distance from the body, the farthest", farthest))
-    exact, walk = context.files(f"{take.name} files", (solved, found.told(take), take.source.path, take.source.who,
-                                                       take.unit, factor, found.zero, work.config.angles),
-                                lambda folder: write_take(place(folder), take, found.find_known(take), factor))
+    inputs = (solved, found.told(take), take.source.path, take.source.who, take.unit, factor, found.zero,
+              work.config.angles)
+    exact, gait, reactions = context.files(
+        f"{take.name} files", inputs, lambda folder: write_take(place(folder), take, found.find_known(take), factor))
     metrics += exact
     shown: list[Any] = []
     if (body := work.character) is not None:
@@ -298,12 +271,12 @@ def _write(work: MoshTask, found: _Found, take: Take, context: TaskContext, sett
                                       lambda folder: _character(body, take, place(folder), factor))
         metrics += errors
     start = clocks()
-    context.files(f"{take.name} page", (solved, metrics, settings, walk, shown and (shown, factor)), page)
+    context.files(f"{take.name} page", (solved, metrics, settings, gait, reactions, shown and (shown, factor)), page)
     return metrics, clocks() - start
 
 
 def write_take(folder: Path, take: Take, known: Known = NOTHING_KNOWN, factor: float = 1.0
-               ) -> tuple[list[Metric], Walk]:
+               ) -> tuple[list[Metric], GaitCycles | None, GroundReactions | None]:
     """Write all files of a sequence but its page; exaggerated.glb only for a factor on soft tissue other than 1.
 
     Angles and joint centres between parts that the markers do not determine are empty cells, as far as that is `known`.
@@ -311,7 +284,7 @@ def write_take(folder: Path, take: Take, known: Known = NOTHING_KNOWN, factor: f
     """
     motion, body, soft = take.motion, take.subject, take.soft
     angles = write_motion_folder(folder, motion, body, take.artefacts.virtual(), known)
-    walk = Walk(None, None) if angles is None else write_walk(folder, take, angles)
+    gait, reactions = (None, None) if angles is None else write_walk(folder, take, angles)
     exact = write_glb(folder / "animation.glb", take.shown, body, None if soft is None else take.make)
     if soft is not None:
         soft.save(folder / "soft_tissue.npz")
@@ -332,10 +305,10 @@ def write_take(folder: Path, take: Take, known: Known = NOTHING_KNOWN, factor: f
         *((b.kind, b.label, b.begin, b.end, f"{b.distance:.4g}") for b in take.artefacts.bad)]
     tables.write_table(folder / "artefacts.csv", ("artefact", "markers", "begin", "end", "distance"),
                        sorted(rows, key=lambda row: (row[2], row[1])))
-    return exact, walk
+    return exact, gait, reactions
 
 
-def write_walk(folder: Path, take: Take, angles: JointAngles) -> Walk:
+def write_walk(folder: Path, take: Take, angles: JointAngles) -> tuple[GaitCycles | None, GroundReactions | None]:
     """Write gait cycles and events of somebody who walks, and grf.mot of a C3D file with force plates."""
     path, motion = take.source.path, take.motion
     events = find_gait_events(motion, take.subject, joint_centres(motion, take.subject), angles, path, take.source.who)
@@ -350,7 +323,7 @@ def write_walk(folder: Path, take: Take, angles: JointAngles) -> Walk:
             warnings.warn(f"grf.mot is not written: {problem}", stacklevel=2)
     if reactions is not None:
         write_ground_reactions(folder / "grf.mot", reactions)
-    return Walk(gait, reactions)
+    return gait, reactions
 
 
 def _character(character: BodyModel, take: Take, folder: Path, factor: float) -> tuple[np.ndarray, str, list[Metric]]:
@@ -377,7 +350,7 @@ def _person_metrics(found: _Found) -> list[Metric]:
             Metric("volume", 1000 * abs(body.volume), "l")]
     if found.guess is not None:
         told.append(Metric("sex", f"{found.guess.sex} ({100 * found.guess.probability:.0f}%)"))
-    return [*told, *found.covered.metrics(), *result.misplaced.metrics(), *result.person.metrics(found.usual),
+    return [*told, *result.covered.metrics(), *result.misplaced.metrics(), *result.person.metrics(found.usual),
             Metric("markers beside the layout's places, mean", float(moved.mean()), "mm"),
             *details([Metric("layout", found.layout_name), Metric("sequences", len(found.takes)),
                       Metric("body shape from the mean person, length of the betas",
@@ -392,9 +365,7 @@ def _figures(takes: Sequence[Take]) -> list[Metric]:
     fixed = [t.motion.residuals_of_trusted() for t in takes]
     soft = [np.where(np.isnan(t.motion.residuals_of_trusted()), np.nan,
                      t.soft.motion.residuals) for t in takes if t.soft is not None]
-    held = [t.held for t in takes if t.held is not None]
-    held_soft = [h.soft for h in held if h.soft is not None]
-    for name, values in zip(ERRORS, ([h.fixed for h in held], held_soft, fixed, soft), strict=True):
+    for name, values in zip(ERRORS, (fixed, soft), strict=True):
         if values:
             out.append(Metric(name, MM * float(np.nanmean(np.concatenate([v.ravel() for v in values]))), "mm"))
     # counts of missing, bad and filled positions

@@ -24,6 +24,7 @@ __all__ = ["AnimateConfig", "animate"]
 
 # share of the body's size, 5 mm on a man: a frame has converged when the last round moves no marker farther
 STILL = 0.0037
+SMOOTH_ROUNDS = 2                    # over the whole sequence: the second corrects labels and outliers by the first
 
 
 @one_thread()
@@ -78,13 +79,8 @@ def animate(subject: Subject, markers: MarkerSequence, layout: MarkerLayout, con
     columns, known_layout = layout.match_columns(markers.labels)
     targets = markers.positions[:, columns]
     body = MarkedBody(subject, known_layout, config.prior_weight, config.prior_shrinkage)
-    # all frames together, or one after the other
-    if config.smoothing or config.ground:
-        start = None if near is None else body.body.join(near.poses, near.trans)
-        x, order, converged = follow_whole(body, targets, markers.rate, config, report_progress, start)
-    else:
-        x, order, converged = follow_frames(body, targets, np.arange(len(targets)), markers.rate, config,
-                                            report_progress)
+    start = None if near is None else body.body.join(near.poses, near.trans)
+    x, order, converged = follow_whole(body, targets, markers.rate, config, report_progress, start)
     pose, trans, _ = body.body.split(x)
     if config.low_pass:
         pose, trans = low_pass(pose, trans, markers.rate, config.low_pass)
@@ -130,11 +126,10 @@ def follow_whole(body: MarkedBody, targets: np.ndarray, rate: float, config: Ani
     T, stiffness = len(targets), config.inertia(rate, body.n_unknowns)
     x = between_keys(body, targets, rate, config) if start is None else start.copy()
     moved, feet, inside, hinges = np.zeros(T), None, span_with_markers(targets), Hinges(body)
-    free = max(config.smoothing, 1)
-    rounds = free + 2 * (config.ground and T > 2)                       # two more rounds with foot contact
+    rounds = SMOOTH_ROUNDS + 2 * (config.ground and T > 2)              # two more rounds with foot contact
     for i in range(rounds):
-        if i == free:
-            feet = FootContact(body, x, rate, config.floor)
+        if i == SMOOTH_ROUNDS:
+            feet = FootContact(body, x, rate)
         # swapped labels are corrected, lost limbs initialised again, and outliers lose their weight
         order = label_order(body.positions(x), targets, rate, config.outlier)
         taken = np.take_along_axis(targets, order[..., None], axis=1)[inside]

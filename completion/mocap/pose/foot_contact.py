@@ -21,16 +21,8 @@ class Floor:
     height: float
 
     @staticmethod
-    def from_numbers(numbers: tuple[float, float, float, float]) -> Floor:
-        """Make a floor from a normal, not zero, and a height."""
-        length = float(np.linalg.norm(numbers[:3]))
-        if not (length > 0 and np.isfinite(numbers).all()):
-            raise ValueError(f"floor: expected a normal and a height, got {numbers}")
-        return Floor(np.array(numbers[:3]) / length, float(numbers[3]))
-
-    @staticmethod
     def below(vertices: np.ndarray) -> Floor:
-        """Estimate the floor under a moving body (n, N, 3), metres; give it for people who lie or sit.
+        """Estimate the floor under a moving body (n, N, 3), metres, of somebody who stands or walks.
 
         Up is the world axis along which the body is longest. Down is the end with the broader support at a more
         constant height.
@@ -54,20 +46,16 @@ class Floor:
 
 
 class FootContact:
-    """The soles of a body over a motion x (T, P), and where they stand.
-
-    The floor is that of `AnimateConfig.floor`, or is estimated below the body.
-    """
+    """The soles of a body over a motion x (T, P), and where they stand on the floor that is estimated below them."""
 
     TOUCH = 0.025                        # metres: a point may stand when it is this close to the floor
 
-    def __init__(self, body: MarkedBody, x: np.ndarray, rate: float,
-                 floor: tuple[float, float, float, float] | None = None) -> None:
+    def __init__(self, body: MarkedBody, x: np.ndarray, rate: float) -> None:
         self.body, subject = body, body.body.subject
         # some 150 bodies of the motion tell the floor and the vertices near it
         pose, trans, _ = body.body.split(x[np.unique(np.linspace(0, len(x) - 1, 150).astype(int))])
         vertices = subject.vertices(pose, trans)
-        self.floor = Floor.below(vertices) if floor is None else Floor.from_numbers(floor)
+        self.floor = Floor.below(vertices)
         # the soles: at most 24 vertices spread over all that come near the floor in 5% of the frames, and the lowest
         # vertex of every frame, as heels are round
         rest, height = subject.template.vertices, self.floor.above(vertices)

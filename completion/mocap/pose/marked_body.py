@@ -10,7 +10,6 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import partial
-from typing import Annotated
 
 import numpy as np
 
@@ -22,7 +21,7 @@ from model.priors import gaussian_prior
 from scanprep.geometry import rotations
 from scanprep.geometry.least_squares import Dense, Minimum, levenberg_marquardt, retract_pose, step_between
 from scanprep.geometry.mesh import Mesh
-from scanprep.ranges import FLAG, Positive, Settings, Share, Signed
+from scanprep.ranges import Positive, Settings
 
 from ...smoothing import inertia, solve_coupled_steps
 from ..marker_sets.layout import MarkerLayout
@@ -31,6 +30,8 @@ from .part_shapes import PartShapes, part_shapes
 BATCH = 64                           # frames whose derivatives are in memory at once
 MOST = 512                           # frames that are solved at once, each by itself
 RATE = 120.0                         # frames per second for which [MoSh] means the weight of the velocity
+SHRINKAGE = 0.3                      # of the covariance of poses: a few dozen poses show correlations by chance
+PLACE_ACCELERATION = 15.0            # m/s², sd of the acceleration of the place: one and a half times gravity
 
 
 @dataclass(frozen=True)
@@ -46,25 +47,19 @@ class AnimateConfig(Settings):
         to three times the median residual.
     prior_weight : float
         Factor on the pose prior. It is small, so the prior matters only for joints that no marker sees.
-    prior_shrinkage : float in [0, 1]
-        See `gaussian_prior`.
     angle_acceleration : float, radians per second squared
         Standard deviation of the acceleration of joint angles.
-    place_acceleration : float, metres per second squared
-        Standard deviation of the acceleration of the place.
-    smoothing : int
-        Rounds over the whole sequence; 0 leaves the frame-by-frame solution.
     low_pass : float, hertz
         Cut-off of a Butterworth filter without lag on the result; 0 is none.
     ground : bool
         Foot contact: feet do not sink into the floor and do not slide while they stand on it.
-    floor : four numbers, optional
-        A unit normal that points up, and the height of the floor along it, metres; else both come from the motion.
+    published : bool
+        As in [MoSh]: a pose prior without shrinkage, and places that are not smoothed.
 
     Examples
     --------
-    >>> AnimateConfig(ground=True).smoothing
-    2
+    >>> AnimateConfig(ground=True).marker_sd
+    0.01
 
     [SCAPE] §8
     """
@@ -72,17 +67,31 @@ class AnimateConfig(Settings):
     marker_sd: Positive = 0.01
     outlier: Positive = 0.06
     prior_weight: float = 0.3
-    prior_shrinkage: Share = 0.3
     angle_acceleration: Positive = 60.0
-    place_acceleration: Positive = 15.0
-    smoothing: int = 2
     low_pass: float = 0.0
-    ground: Annotated[bool, FLAG] = False
-    floor: tuple[Signed, Signed, Signed, Signed] | None = None
+    ground: bool = False
+    published: bool = False
+
+    @classmethod
+    def from_weights(cls, data: float, pose: float, velocity: float) -> AnimateConfig:
+        """Convert weights for squared centimetres, for the pose prior and for squared radians to settings.
+
+        A weight is an inverse variance. That of the change of velocity from frame to frame is meant for 120 frames per
+        second; at another rate it allows the same acceleration.
+
+        [MoSh] Eq. 17, Eq. 21, Eq. 22
+        """
+        return cls(marker_sd=0.01 * data**-0.5, prior_weight=pose, angle_acceleration=RATE**2 * velocity**-0.5)
+
+    @property
+    def prior_shrinkage(self) -> float:
+        """Share in [0, 1] by which the covariance of the poses is shrunk, see `gaussian_prior`."""
+        return 0.0 if self.published else SHRINKAGE
 
     def inertia(self, rate: float, n_unknowns: int) -> np.ndarray:
         """Compute the information (P,) of the change of velocity from frame to frame."""
-        return inertia(n_unknowns, rate, self.angle_acceleration, self.place_acceleration)
+        # 1e6: so large that places are not smoothed
+        return inertia(n_unknowns, rate, self.angle_acceleration, 1e6 if self.published else PLACE_ACCELERATION)
 
 
 class MarkedBody:
@@ -91,7 +100,8 @@ class MarkedBody:
     A step (P,) rotates every joint from the right, `exp(pose) exp(d)`, so a half turn is nothing special.
     """
 
-    def __init__(self, subject: Subject, layout: MarkerLayout, prior_weight: float, prior_shrinkage: float) -> None:
+    def __init__(self, subject: Subject, layout: MarkerLayout, prior_weight: float,
+                 prior_shrinkage: float = SHRINKAGE) -> None:
         self.body = FixedBody(check_subject(subject))
         self.count = len(layout.labels)
         self.n_unknowns = self.body.n_angles + 3

@@ -69,8 +69,10 @@ def retarget(motion: Motion, source: Subject, target: Subject) -> Motion:
 
 
 def morph_vertices(model: BodyModel, motion: Motion, betas: np.ndarray | Mapping[float, np.ndarray],
-                   frames: np.ndarray | slice = slice(None), grounded: bool = True) -> np.ndarray:
+                   frames: np.ndarray | slice = slice(None)) -> np.ndarray:
     """Compute the meshes (n, N, 3), metres, of a motion while the shape of the body changes.
+
+    Each frame is moved vertically so that its lowest point is as high as that of the motion's own body.
 
     Vertices are affine in betas, so a change along a line needs two bodies only. A few frames of a body that changes in
     many directions are computed one by one.
@@ -85,8 +87,6 @@ def morph_vertices(model: BodyModel, motion: Motion, betas: np.ndarray | Mapping
         For every frame, or at some times, with linear interpolation.
     frames : indices or slice, optional
         Frames to compute, all by default.
-    grounded : bool
-        Move each frame vertically so that its lowest point is as high as that of the motion's own body.
 
     Raises
     ------
@@ -111,11 +111,10 @@ def morph_vertices(model: BodyModel, motion: Motion, betas: np.ndarray | Mapping
         out = first.vertices(poses, trans).astype(np.float64)
         for share, step in zip(shares.T, steps, strict=True):
             out += share[:, None, None] * model.operator(middle + step).plus(-1, first.operator).evaluate(poses)
-    if grounded:
-        own = model.subject(motion.betas)
-        up, sign = world_up(motion, own)
-        low = lowest_heights(own, poses, trans, up, sign)
-        out[:, :, up] += (sign * (low - (sign * out[:, :, up]).min(axis=1)))[:, None]
+    body = model.subject(motion.betas)
+    up, sign = world_up(motion, body)
+    low = lowest_heights(body, poses, trans, up, sign)
+    out[:, :, up] += (sign * (low - (sign * out[:, :, up]).min(axis=1)))[:, None]
     return out
 
 

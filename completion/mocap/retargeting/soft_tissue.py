@@ -124,10 +124,9 @@ def moving_character(character: BodyModel, soft: SoftTissue, frames: np.ndarray)
 FULL = 0.2                           # deformation at the end of the heat map, a fifth longer or shorter
 
 
-def picture_transfer(model: BodyModel, soft: SoftTissue, character: BodyModel, moved: SoftTissue, count: int = 8,
-                     height: int = 320) -> np.ndarray:
-    """Render frames in three rows: the person, the character with motion `moved`, its deformation. [MoSh]"""
-    frames = spread_indices(len(soft.motion.poses), count)
+def picture_transfer(model: BodyModel, soft: SoftTissue, character: BodyModel, moved: SoftTissue) -> np.ndarray:
+    """Render eight frames in three rows: the person, the character with motion `moved`, its deformation. [MoSh]"""
+    frames, height = spread_indices(len(soft.motion.poses), 8), 320
     person = moving_character(model, soft, frames)[1]
     fixed, changed = moving_character(character, moved, frames)
     colors = heat(deformation(character.template.faces, fixed, changed), 0.0, FULL)
@@ -161,19 +160,17 @@ class Creases:
     """Finds inverted triangles of a posed body, and smooths them.
 
     A triangle is inverted when it faces away from its rest normal, rotated by its parts. Rotations are blended over
-    `blend` rings of vertices: at a raised shoulder the skin rightly faces away from its own part.
+    six rings of vertices: at a raised shoulder the skin rightly faces away from its own part.
     """
 
-    def __init__(self, rest: Mesh, skeleton: Skeleton, blend: int = 6) -> None:
+    def __init__(self, rest: Mesh, skeleton: Skeleton) -> None:
         self.rest, self.skeleton = rest, skeleton
         self._near = csr_array(rest.vertex_adjacency, dtype=np.float64)
-        self._shares = np.eye(len(skeleton.parents))[skeleton.part_of_face]
-        if blend:
-            own = np.eye(len(skeleton.parents))[skeleton.part_of_vertex(rest)]
-            spread = diags_array(1 / (1 + np.asarray(self._near.sum(axis=1)).ravel()))
-            for _ in range(blend):
-                own = spread @ (own + self._near @ own)
-            self._shares = own[rest.faces].mean(axis=1)
+        shares = np.eye(len(skeleton.parents))[skeleton.part_of_vertex(rest)]
+        spread = diags_array(1 / (1 + np.asarray(self._near.sum(axis=1)).ravel()))
+        for _ in range(6):
+            shares = spread @ (shares + self._near @ shares)
+        self._shares = shares[rest.faces].mean(axis=1)
 
     def find_inverted(self, bodies: np.ndarray, poses: np.ndarray) -> np.ndarray:
         """Find inverted triangles (..., F) of bodies (..., N, 3) in poses (..., J, 3)."""

@@ -28,6 +28,7 @@ from .soft_tissue import SkinMovement, SoftTissue, in_root, in_world, smooth_mod
 ROUNDS = 3                           # Gauss-Newton steps over the whole sequence, which starts near the solution
 LOOSE = 3.0                          # prior sd over the size of the movement; at 1 the prior shrinks the result
 WINDOW, OVERLAP = 400, 40            # frames smoothed at once, and those shared with each neighbour
+MARKER_SD = 0.001                    # metres, sd of a marker from the moving skin: the error of the cameras
 
 
 @dataclass(frozen=True)
@@ -45,8 +46,6 @@ class SoftTissueConfig(Settings):
         Weight of the pose prior; the paper's is 1.
     velocity : float
         Weight of the squared change of velocity from frame to frame, 120 frames a second; the paper's is 6.25.
-    marker_sd : float, metres
-        Standard deviation of a marker from the moving skin: the error of the cameras.
     reach : float, metres
         Distance along the skin at which the movements of two points have a correlation of 0.6.
     temporal_smoothness : float
@@ -54,9 +53,7 @@ class SoftTissueConfig(Settings):
         that of the movement itself.
     shape_change : float
         Weight of the squared change of the betas from the person's own; the paper's is 0.25. With 0 the skin moves and
-        the betas stay, by `marker_sd`, `reach` and `temporal_smoothness`.
-    outlier : float, metres
-        Residual at which a marker has lost three quarters of its weight.
+        the betas stay, by `reach` and `temporal_smoothness`; where betas change, all markers have the same weight.
 
     Examples
     --------
@@ -69,22 +66,20 @@ class SoftTissueConfig(Settings):
     data: Positive = 2.0
     pose: float = 0.3
     velocity: Positive = 57600.0
-    marker_sd: Positive = 0.001
     reach: Positive = 0.09
     temporal_smoothness: float = 2.0
     shape_change: float = 0.0
-    outlier: Positive = 0.06
 
     @classmethod
     def from_paper(cls) -> SoftTissueConfig:
         """Return the weights of [MoSh] Eq. 24, with betas that change in every frame."""
-        return cls(data=0.75, pose=1.0, velocity=6.25, outlier=1000.0, shape_change=0.25)
+        return cls(data=0.75, pose=1.0, velocity=6.25, shape_change=0.25)
 
 
 @one_thread()
 def follow_soft_tissue(model: BodyModel, motion: Motion, markers: MarkerSequence, layout: MarkerLayout,
-                       config: SoftTissueConfig | None = None, progress: Progress | None = None, ground: bool = False,
-                       floor: tuple[float, float, float, float] | None = None) -> SoftTissue:
+                       config: SoftTissueConfig | None = None, progress: Progress | None = None, ground: bool = False
+                       ) -> SoftTissue:
     """Estimate the soft tissue of a motion: how the skin moves on the body.
 
     [MoSh] changes the betas in every frame, with a penalty on the squared change; `SoftTissueConfig.from_paper()` does
@@ -109,8 +104,6 @@ def follow_soft_tissue(model: BodyModel, motion: Motion, markers: MarkerSequence
         Called with (done, total) frames.
     ground : bool
         Foot contact, as by `AnimateConfig.ground`.
-    floor : four numbers, optional
-        A unit normal that points up, and the height of the floor along it, metres; else both come from the motion.
 
     Returns
     -------
@@ -149,10 +142,11 @@ def follow_soft_tissue(model: BodyModel, motion: Motion, markers: MarkerSequence
     follower = (ShapeFollower if config.shape_change else SkinFollower)(model, motion, markers, layout, config)
     body, targets, T = follower.body, follower.targets, len(motion.poses)
     x = body.body.join(motion.poses, motion.trans)
-    feet = FootContact(body, x, markers.rate, floor) if ground and T > 2 else None
+    feet = FootContact(body, x, markers.rate) if ground and T > 2 else None
 
     # robust weights of the markers, and the frames from the first to the last with any weight
-    share, _ = marker_weights(body.positions(x), targets, 1.0, config.outlier)
+    outlier = 1000.0 if config.shape_change else AnimateConfig.outlier     # metres; the paper weights all equally
+    share, _ = marker_weights(body.positions(x), targets, 1.0, outlier)
     share *= motion.trusted[:, follower.rows]
     used = np.flatnonzero((share > 0).any(axis=1))
     used = np.arange(used[0], used[-1] + 1) if len(used) else used
@@ -190,9 +184,8 @@ class SoftFollower(ABC):
         assert motion.betas is not None, "checked"
         self.rows, self.layout = layout.match_columns(markers.labels)
         self.config, self.n_betas, self.targets = config, len(motion.betas), markers.positions[:, self.rows]
-        poses = AnimateConfig(prior_weight=config.pose, angle_acceleration=RATE**2 / np.sqrt(config.velocity))
-        if config.shape_change:                  # as in the paper: no shrinkage of the prior, no smoothing of places
-            poses = replace(poses, prior_shrinkage=0.0, place_acceleration=1e6)
+        poses = AnimateConfig(prior_weight=config.pose, angle_acceleration=RATE**2 / np.sqrt(config.velocity),
+                              published=bool(config.shape_change))
         self.body = MarkedBody(model.subject(motion.betas), self.layout, config.pose, poses.prior_shrinkage)
         self.inertia = poses.inertia(markers.rate, self.body.n_unknowns)
         # 1e4: from square centimetres to square metres
@@ -257,7 +250,7 @@ class SkinFollower(SoftFollower):
         """Return whitening by the scatter of the markers, correlated over the skin."""
         strays = variances(self.off(x, targets), share)
         # twice the median variance is noise of the pose; what a marker has beyond it is soft tissue
-        noise = max(2.0 * float(np.median(strays)), self.config.marker_sd**2)
+        noise = max(2.0 * float(np.median(strays)), MARKER_SD**2)
         root = np.sqrt(np.maximum(strays / noise - 1, 0))[:, None] * self.root
         return lambda x, share: whiten(root @ root.T, share)
 
@@ -275,7 +268,7 @@ class SkinFollower(SoftFollower):
 
         [MoSh] Eq. 24, with z in place of β_t
         """
-        sd = self.config.marker_sd
+        sd = MARKER_SD
         size = LOOSE * np.sqrt(np.maximum(variances(off, share) - sd**2, (0.1 * sd)**2))
         root = size[:, None] * self.root                                       # the movement is root @ z, z ~ N(0, 1)
         # minimise Σ |root z - off|² / sd² + |z|² + smoothness |second difference of z|², in overlapping windows

@@ -36,7 +36,7 @@ def start_frames(body: MarkedBody, targets: np.ndarray, report_progress: Callabl
     return np.array(found)[np.argsort(order)]
 
 
-def _from_found(body: MarkedBody, found: Sequence[np.ndarray], targets: np.ndarray, most: int = 3) -> np.ndarray:
+def _from_found(body: MarkedBody, found: Sequence[np.ndarray], targets: np.ndarray) -> np.ndarray:
     """Fit a frame of markers (L, 3) from the poses found so far that suit it best; return the unknowns (P,)."""
     # lay every pose on the markers by Procrustes, and solve from the best ones
     x, there = np.array(found), ~np.isnan(targets[:, 0])
@@ -45,7 +45,7 @@ def _from_found(body: MarkedBody, found: Sequence[np.ndarray], targets: np.ndarr
         row[:3] = rotations.log(R @ rotations.exp(row[:3]))
     x[:, -3:] += (targets - body.positions(x))[:, there].mean(axis=1)
     off = np.nanmean(np.linalg.norm(body.positions(x) - targets, axis=2), axis=1)
-    x = x[np.argsort(off)[:most]]
+    x = x[np.argsort(off)[:3]]
     end = body.solve(x, targets, np.full(len(targets), MEAN_PERSON.marker_sd**-2), 20, 1e-3)
     return end.x[np.argmin(end.energy)]
 

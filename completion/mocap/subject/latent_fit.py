@@ -6,7 +6,6 @@ Frames share the unknowns `z = (betas (K), coefficients of the latent markers (3
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Literal
 
 import numpy as np
 
@@ -17,7 +16,7 @@ from model.fitting.energy import MovingPoints
 from model.linear import combination_weights
 from model.priors import gaussian_prior
 from scanprep.geometry.least_squares import Arrow, Residual, levenberg_marquardt, normal_equations
-from scanprep.ranges import Count, Positive, Seed, Settings
+from scanprep.ranges import Count, Positive, Settings
 from scanprep.skeleton.roles import find_numbered_roles
 
 from ..marker_sets.layout import DISTANCE, MarkerLayout
@@ -46,13 +45,8 @@ class PersonConfig(Settings):
     ----------
     frames : int
         Number of frames, over all sequences.
-    choice : "spread" or "random"
-        Frames that differ most, or random ones.
     n_betas : int
         Largest number of betas; the others stay zero.
-    attachment : "triangle" or "neighbourhood"
-        A latent marker in the coordinate frame of its nearest triangle, or as a sum of the neighbours of its
-        nearest vertex and the normal there.
     data : float
         Weight of the markers against their simulation; the paper's is 0.75.
     surface : float
@@ -63,20 +57,11 @@ class PersonConfig(Settings):
         Weight of the shape prior; 1 is the distribution of people in the model.
     pose : float
         Weight of the pose prior.
-    flexion : float, degrees
-        How much further hips, knees and ankles bend than in the training poses, which are of people who stand and walk;
-        0 is the paper. A crouched person stood up otherwise, with markers moved along the skin instead.
     annealing : floats
         Factors on the last three weights, one stage each.
-    outlier : float, metres
-        Residual at which a marker has lost three quarters of its weight; the paper weights all equally.
-    loose : bool
-        Search loose markers of the layout along their limb, with a standard deviation of 20 cm; the paper treats all
-        equally.
-    wand : float, metres
-        Largest extra distance from the skin of markers on wands or bars; 0 keeps the layout's distances, as the paper.
-    seed : int
-        Of the random frames.
+    published : bool
+        As in the paper: random frames, markers of equal weight at the layout's distances, and no more bending than in
+        the training poses. Else frames that differ most, robust weights, and a search for loose markers and wands.
 
     Examples
     --------
@@ -87,26 +72,37 @@ class PersonConfig(Settings):
     """
 
     frames: Count = 12
-    choice: Literal["spread", "random"] = "spread"
     n_betas: int = 80
-    attachment: Attachment = "triangle"
     data: float = 1.5
     surface: float = 4.0
     initial: float = 1.0
     shape: float = 1.0
     pose: float = 0.25
-    flexion: float = 60.0
     annealing: tuple[Positive, ...] = (40.0, 20.0, 10.0, 4.0, 2.0, 1.0)
-    outlier: Positive = 0.06
-    loose: bool = True
-    wand: float = 0.1
-    seed: Seed = 0
+    published: bool = False
 
     @classmethod
     def from_paper(cls) -> PersonConfig:
         """Return the weights of [MoSh], with twelve random frames, six stages and equal markers."""
-        return cls(choice="random", data=0.75, surface=100.0, initial=0.25, flexion=0.0, outlier=1000.0, loose=False,
-                   wand=0.0)
+        return cls(data=0.75, surface=100.0, initial=0.25, published=True)
+
+    @property
+    def flexion(self) -> float:
+        """How much further hips, knees and ankles bend than in the training poses, degrees.
+
+        These are of people who stand and walk. A crouched person stood up otherwise, with markers moved along the skin.
+        """
+        return 0.0 if self.published else 60.0
+
+    @property
+    def outlier(self) -> float:
+        """Residual at which a marker has lost three quarters of its weight, metres: beyond soft tissue."""
+        return 1000.0 if self.published else 0.06
+
+    @property
+    def wand(self) -> float:
+        """Largest extra distance from the skin of markers on wands or bars, metres: the usual length of a wand."""
+        return 0.0 if self.published else 0.1
 
 
 @dataclass(frozen=True, eq=False)
@@ -254,15 +250,17 @@ class LatentState:
 class LatentFit:
     """Fit of markers (B, L, 3), metres, of some frames on a body of unknown shape, near the places of a layout."""
 
-    def __init__(self, model: BodyModel, layout: MarkerLayout, targets: np.ndarray, config: PersonConfig) -> None:
+    def __init__(self, model: BodyModel, layout: MarkerLayout, targets: np.ndarray, config: PersonConfig,
+                 attachment: Attachment = "triangle") -> None:
         self.model, self.layout, self.targets, self.config = model, layout, targets, config
+        self.attachment = attachment
         self.n_betas = min(config.n_betas, model.n_betas)
         self.n_angles = 3 * len(model.skeleton.parents)
         rest = np.zeros((len(model.skeleton.parents), 3))
         self.latent = LatentPoints(model.vertices(rest, np.zeros(self.n_betas)),
                                    model.shape_jacobian(rest)[..., :self.n_betas])
         self.prior = gaussian_prior(model.pose_mean, free_flexion(model, config.flexion))
-        self.loose = np.isin(layout.labels, layout.loose) & config.loose
+        self.loose = np.isin(layout.labels, layout.loose) & (not config.published)
         self.reach = distance_reach(layout, config.wand)
         # usual place of a loose marker: 0.0025 is a standard deviation of 20 cm
         self.place_weight = np.where(self.loose, min(0.0025, config.initial), config.initial)
@@ -317,7 +315,7 @@ class LatentFit:
                 reach: tuple[np.ndarray, np.ndarray], looked: bool) -> LatentState:
         """Return the state with markers at points (L, 3) of the latent pose, each attached to its nearest triangle."""
         vertices = self.latent.at(betas)
-        markers = latent_markers(self.model.template.with_vertices(vertices), points, self.config.attachment)
+        markers = latent_markers(self.model.template.with_vertices(vertices), points, self.attachment)
         corners = self.latent.combine(markers.corners.reshape(-1, 1), np.ones((3 * len(points), 1)))
         return LatentState(x, betas, markers.coefficients(vertices, points), markers, self._supports(markers),
                            self.latent.combine(markers.ids, markers.weights), corners, layout, *reach, looked)

@@ -21,6 +21,7 @@ from ...motion import Progress
 from ..files.markers import MarkerSequence
 from ..marker_sets.layout import MarkerLayout
 from ..marker_sets.named import fitting_layout
+from .attachment import Attachment
 from .frame_starts import mean_person, start_frames
 from .latent_fit import ON_SKIN, LatentFit, PersonConfig
 
@@ -110,8 +111,8 @@ def judge_moves(moves: Mapping[str, float], count: int) -> Judgement:
 
 @one_thread()
 def find_person(model: BodyModel, sequences: MarkerSequence | Sequence[MarkerSequence], layout: MarkerLayout,
-                config: PersonConfig | None = None, progress: Progress | None = None, step: Step = run_uncached
-                ) -> PersonFit:
+                config: PersonConfig | None = None, progress: Progress | None = None, step: Step = run_uncached,
+                attachment: Attachment = "triangle") -> PersonFit:
     """Find the betas of a person and the places of the markers on the skin, from some frames of its sequences.
 
     Betas, latent markers, and the pose and place in each frame are solved for together. At first they are held close to
@@ -132,6 +133,9 @@ def find_person(model: BodyModel, sequences: MarkerSequence | Sequence[MarkerSeq
         Called with (done, total).
     step : callable, optional
         Keeps intermediate results, as `TaskContext.step` does.
+    attachment : "triangle" or "neighbourhood"
+        A latent marker in the coordinate frame of its nearest triangle, or, as in the first version of the paper, Eq. 2
+        to 4, as a sum of the neighbours of its nearest vertex and the normal there.
 
     Returns
     -------
@@ -166,12 +170,12 @@ def find_person(model: BodyModel, sequences: MarkerSequence | Sequence[MarkerSeq
     known, positions = common_markers(sequences, layout)
     chosen, stages = choose_frames(positions, config), len(config.annealing)
     targets, report_progress = np.concatenate(positions)[chosen], progress or (lambda done, total: None)
-    total, inputs = len(chosen) + stages, (model, known, targets, config)
+    total, inputs = len(chosen) + stages, (model, known, targets, config, attachment)
 
     # the poses of the mean person in these frames, then everything together, stage by stage
     mean = mean_person(model.subject(np.zeros(min(config.n_betas, model.n_betas))), known)
     x = step("person, start", inputs, lambda: start_frames(mean, targets, lambda done: report_progress(done, total)))
-    fit = LatentFit(model, known, targets, config)                                          # [MoSh] Eq. 15
+    fit = LatentFit(model, known, targets, config, attachment)                                          # [MoSh] Eq. 15
     state, steps, converged = fit.start(x), 0, False
     for i, factor in enumerate(config.annealing):
         last = i == stages - 1
@@ -234,8 +238,6 @@ def common_markers(sequences: Sequence[MarkerSequence], layout: MarkerLayout
 
 def choose_frames(positions: Sequence[np.ndarray], config: PersonConfig) -> np.ndarray:
     """Choose well-seen frames (B,), counted through all sequences (T, L, 3): those that differ most, or random ones."""
-    if config.choice not in ("spread", "random"):
-        raise ValueError(f"choice: expected spread or random, got {config.choice!r}")
     together = np.concatenate(positions)
     seen = (~np.isnan(together[..., 0])).sum(axis=1)
     if seen.max(initial=0) < 3:
@@ -243,8 +245,8 @@ def choose_frames(positions: Sequence[np.ndarray], config: PersonConfig) -> np.n
                          f"{seen.max(initial=0)}")
     # 0.9: frames with fewer than that share of the most markers of any frame are not used
     good = np.flatnonzero(seen >= max(3, 0.9 * seen.max()))
-    if config.choice == "random":
-        rng = np.random.default_rng(config.seed)
+    if config.published:
+        rng = np.random.default_rng(0)
         return np.sort(rng.choice(good, min(config.frames, len(good)), replace=False))
     return good[spread_frames(together[good], config.frames)]
 
