@@ -1,4 +1,4 @@
-"""`scape label`, `--unlabelled` of `animate` and `mosh`, and `scape layout find`, as users call them."""
+"""`scape label`, and `--unlabelled` of `animate` and `mosh`, as users call them."""
 import json
 import warnings
 
@@ -11,16 +11,12 @@ from completion.__main__ import main
 from completion.mocap.files.c3d import point_table
 from completion.mocap.files.c3d_points import rename_points
 from completion.mocap.files.markers import MarkerSequence, read_markers, write_markers
-from completion.mocap.labelling import unknown_layout
 from completion.mocap.labelling.corrections import read_corrections
 from completion.mocap.labelling.label import GHOST
 from completion.mocap.labelling.recording import pack_tracks
 from completion.mocap.labelling.tracks import link_points
-from completion.mocap.labelling.unknown_layout import name_markers, suggest_names
-from completion.mocap.marker_sets.layout import MarkerLayout
 from completion.mocap.marker_sets.named import choose_layout
 from completion.mocap.marker_sets.opensim import opensim_markers
-from completion.mocap.subject.person import PersonConfig
 from model import load_model
 from scanprep.geometry.landmark_writing import marker_set
 from scanprep.geometry.tables import read_table
@@ -132,7 +128,6 @@ def test_labels_that_are_there_are_believed_unless_told_otherwise(place):
     (("label", "raw.c3d", "--layout", "cmu41", "--unit", "m", "-o", "x.c3d"), "metres taken for millimetres"),
     (("animate", "raw.c3d", "--unlabelled", "-o", "x"), "--unlabelled: expected --layout"),
     (("mosh", "raw.c3d", "--unlabelled", "-o", "x"), "--unlabelled: expected --layout"),
-    (("layout", "find", "few.c3d", "-o", "x.json"), "at least 10 tracks that are seen in 30% of the frames"),
 ])
 def test_what_cannot_be_labelled_is_told(place, capsys, words, said):
     raw = read_markers(place / "raw.c3d")
@@ -206,35 +201,3 @@ def test_a_marker_set_of_opensim_is_a_layout(tmp_path):
         (tmp_path / "bad.xml").write_text(text)
         with pytest.raises(ValueError, match=words):
             choose_layout(model, str(tmp_path / "bad.xml"), ())
-
-
-@pytest.mark.slow
-def test_a_layout_is_found_by_the_command(place, monkeypatch):
-    """With little effort, of a person who stands still: which is what the verdict says."""
-    for name, value in (("STARTS", 1), ("TRIED", 1), ("ROUNDS", 1), ("NAMED", 1),
-                        ("CLOSER", PersonConfig(frames=4, n_betas=5, pose=0.02))):
-        monkeypatch.setattr(unknown_layout, name, value)
-    true = read_markers(place / "true.c3d")
-    names = tuple(f"u{i}" for i in range(len(true.labels)))
-    still = np.repeat(true.positions[:1], 12, axis=0)
-    write_markers(place / "tracks.c3d", MarkerSequence(still, names, true.rate))
-    assert run(place, "layout", "find", "tracks.c3d", "-o", "found.json") == 0
-    found = MarkerLayout.load(place / "found.json")
-    assert len(found.labels) > 0.7 * len(true.labels)
-    told = json.loads((place / "found.json.report.json").read_text())["judgement"]
-    assert told["verdict"] == "check" and "the person hardly moves" in " ".join(told["reasons"])
-    assert (place / "found.png").exists() and "uncertain by" in (place / "found.report.html").read_text()
-
-
-def test_markers_of_a_usual_set_get_its_names():
-    """On the model's own body, each up to three centimetres beside its place; markers anywhere get those of parts."""
-    model = load_model("people")
-    usual, _ = choose_layout(model, "vicon47", ())
-    vertices, rng = model.template.vertices, np.random.default_rng(0)
-    near = [rng.choice(np.flatnonzero(np.linalg.norm(vertices - place, axis=1) < 0.03))
-            for place in usual.skin_points(vertices)]
-    worn = MarkerLayout(tuple(f"u{i}" for i in range(47)), np.array(near))
-    found, names = name_markers(model, worn)
-    assert found is not None and np.mean([names.get(f"u{i}") == label for i, label in enumerate(usual.labels)]) > 0.9
-    few = worn.select(worn.labels[:1])
-    assert suggest_names(model, few, {})[0].rstrip("0123456789") in model.skeleton.names
