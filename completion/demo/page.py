@@ -15,14 +15,13 @@ from scanprep.geometry.mesh import Mesh
 from scanprep.judgement import Judgement
 from scanprep.pictures.camera import look_around
 from scanprep.pictures.page import Page
-from scanprep.pictures.scene import Pane, picture_panes
-from scanprep.pictures.shading import CLAY, Heat, Solid, part_colors
-from scanprep.pictures.sheets import save_png
+from scanprep.pictures.scene import Pane
+from scanprep.pictures.shading import CLAY, Heat, Solid
 from scanprep.pictures.thinning import thin_solid
 
 from ..mocap.files.motion_files import write_glb
-from ..motion_pictures import chart_residuals, pane_with_dots
-from ..partial.report import COMPLETED, HEIGHT, MEASURED, completion_panes, picture_completion
+from ..motion_pictures import pane_with_dots
+from ..partial.report import HEIGHT, completion_panes
 from .chain import Demo
 from .truth import distance, mean_over_area, surface_error
 
@@ -31,35 +30,16 @@ FAR = 0.01                 # metres at the dark end of the heat maps
 
 def write_page(demo: Demo, metrics: list[Metric], judgement: Judgement,
                report_progress: Callable[[int, int], None], to: Path) -> None:
-    """Write `report.html`, the animated GLB and pictures into a folder."""
+    """Write `report.html` and the animated GLB into a folder."""
     page = Page("From raw scans to a moving person",
                 "Every stage of the chain on the built-in people, whose true shape, pose and correspondence are known.")
     page.verdict(judgement, "Next, your own scans: `scape prep run scans --template template.ply -o set`")
     page.figures(metrics, ("measured against the truth", "value", "unit"))
     stages: tuple[Callable[[Demo, Page], None], ...] = (
-        _scans, _template, _registration, _skeleton, _shapes, _poses, partial(_completion, to=to),
-        partial(_animation, to=to))
+        _scans, _template, _registration, _skeleton, _shapes, _poses, _completion, partial(_animation, to=to))
     for i, stage in enumerate(stages):
         stage(demo, page)
         report_progress(i + 1, len(stages))
-    # one picture of the whole chain: scan, registration, parts, body shapes, completion, animation
-    template, model, completion = demo.template, demo.model, demo.completion
-    name = demo.scans[1].name                       # the first pose after rest
-    registered = template.with_vertices(demo.prepared.registered.vertices([name])[0])
-    rest = np.zeros((len(model.skeleton.parents), 3))
-    people = [template.with_vertices(model.vertices(rest, betas)) for betas in (np.array([-1.8]), np.array([1.8]))]
-    walking = demo.motion.vertices(demo.subject, np.array([0, len(demo.motion.poses) // 4]))
-    colors = np.where(completion.seen[:, None], MEASURED, COMPLETED)
-    shown: list[tuple[Mesh | Solid, np.ndarray, float, str]] = [
-        (read_mesh(demo.folder / "scans" / f"{name}.ply"), registered.vertices, 25, "scan"),
-        (registered, registered.vertices, 25, "registered"),
-        (Solid(template, part_colors(model.skeleton.part_of_face)), template.vertices, 0, "parts found"),
-        *((person, np.concatenate([p.vertices for p in people]), 15.0, "body shape") for person in people),
-        (Solid(demo.half_scan[0], MEASURED), completion.completed.vertices, -30, "half a view"),
-        (Solid(completion.completed, colors), completion.completed.vertices, 30, "completed"),
-        *((template.with_vertices(v), v, 40.0, "animated") for v in walking)]
-    save_png(to / "overview.png", picture_panes(
-        [_pane(demo, shape, framed, label, turn) for shape, framed, turn, label in shown], 400))
     page.write(to / "report.html")
 
 
@@ -97,7 +77,7 @@ def _template(demo: Demo, page: Page) -> None:
 
 
 def _registration(demo: Demo, page: Page) -> None:
-    """Add the worst registrations, and a table of them."""
+    """Add the worst registrations."""
     page.section("Registration", "The template on the scans: first bent by the landmarks, then drawn to the scan, at "
                  "last following it to its noise.")
     registered = demo.prepared.registered
@@ -112,12 +92,6 @@ def _registration(demo: Demo, page: Page) -> None:
                   _pane(demo, Solid(meshes[name], off, shades={"plain": np.array(CLAY)}), fits,
                         f"{means[name]:.2f} mm from the truth")]
     _in_rows(page, panes, "the worst: the scan, and the template on it")
-    figures = {one.name: one for one in demo.prepared.figures}
-    worst = 6  # scans in the table of registrations
-    page.table([(name, 1000 * figures[name].distance, means[name], 100 * figures[name].seen)
-                for name in order[:worst]],
-               (f"the worst {min(worst, len(order))} of {len(order)} scans", "to the scan (mm)", "to the truth (mm)",
-                "with data (%)"))
 
 
 def _skeleton(demo: Demo, page: Page) -> None:
@@ -151,14 +125,12 @@ def _poses(demo: Demo, page: Page) -> None:
     _in_rows(page, panes, "the truth, and the model beside it")
 
 
-def _completion(demo: Demo, page: Page, to: Path) -> None:
+def _completion(demo: Demo, page: Page) -> None:
     """Add the half view, the completed body, and its error."""
     page.section("Completion", "One camera saw the person from one side, in a pose that is in no training scan. Blue "
                  "was measured, yellow was filled in by the model.")
     half, marks, truth = demo.half_scan
     done = demo.completion
-    image = picture_completion(half, done, demo.template)
-    save_png(to / "completed" / "completion.png", image)
     error = distance(done.completed.vertices, demo.truth_map.vertices(truth))
     names, vertices, points = match_landmarks(demo.template_landmarks, marks)
     scan, whole = completion_panes(half, done, demo.template, landmarks=(vertices, points),
@@ -169,7 +141,7 @@ def _completion(demo: Demo, page: Page, to: Path) -> None:
 
 
 def _animation(demo: Demo, page: Page, to: Path) -> None:
-    """Add the walk with its markers, and a chart of their distances."""
+    """Add the walk with its markers."""
     sequence, _, _ = demo.walk
     motion, subject = demo.motion, demo.subject
     page.section("Animation", f"{len(sequence.labels)} markers of a walk, 3% of them missing at any time, and the body "
@@ -177,5 +149,4 @@ def _animation(demo: Demo, page: Page, to: Path) -> None:
     write_glb(to / "animation" / "walk.glb", motion, subject)
     page.bodies([pane_with_dots(motion, subject, sequence.positions, "measured markers", sequence.labels)],
                 "the walk with the measured markers", 480)
-    page.chart(chart_residuals(motion), "distance of the markers to where the body puts them")
     page.text("animation/walk.glb, beside this page, plays in any viewer of glTF.")

@@ -19,7 +19,6 @@ from scanprep.pipeline.scans import find_scans
 from scanprep.ranges import Axis, direction_of
 
 from ..cli import ModelOrNone, body_of, marks_of_template, read_model
-from .colors import ColorConfig
 from .folder import FolderCall
 from .settings import CompletionConfig
 from .work import CompletionInputs, CompletionTask
@@ -83,8 +82,7 @@ def complete_scan(scans: ScansArg = (), *, output: Output, model: ModelOrNone = 
     inputs = CompletionInputs(scans, landmarks or landmarks_beside(scans[0]), mask)
     # names of landmarks must be known on the template only if there are any
     marks = {} if inputs.landmarks is None else marks_of_template(loaded, template_landmarks, name)
-    work = CompletionTask(body_of(loaded, subject, unit), name, marks, config, unit,
-                          ColorConfig(fill=config.fill_colors))
+    work = CompletionTask(body_of(loaded, subject, unit), name, marks, config, unit)
     if inputs.landmarks is None:
         warnings.warn("no landmarks; the search starts from typical poses, look at report.html for limbs mixed up",
                       stacklevel=2)

@@ -15,6 +15,7 @@ from scanprep.geometry.places import distinct_places
 from scanprep.geometry.sanitise import sanitise
 
 CLOSE, AGREE = 0.05, 0.95            # metres; least share of triangles this close that face like the body; a walk: 0.99
+NORMAL_POINTS = 24                   # neighbours that make one normal, so that 5 mm of noise does not turn it
 
 Frame = Mesh | PointCloud | np.ndarray | Sequence[View] | None
 
@@ -35,8 +36,7 @@ class _Skin(NamedTuple):
     normals: np.ndarray
 
 
-def prepare_frame(frame: Frame, count: int, neighbours: int, viewpoints: Any = None, expected: Mesh | None = None
-                  ) -> ScanPoints | None:
+def prepare_frame(frame: Frame, count: int, viewpoints: Any = None, expected: Mesh | None = None) -> ScanPoints | None:
     """Return points with normals of a frame, or None when it shows nothing.
 
     Normals are those of planes through many neighbours, so that noise of some millimetres does not turn them. Their
@@ -48,14 +48,14 @@ def prepare_frame(frame: Frame, count: int, neighbours: int, viewpoints: Any = N
     cameras = None if viewpoints is None else np.broadcast_to(np.asarray(viewpoints, float), (len(views), 3))
     skin = None if expected is None else _Skin(cKDTree(expected.vertices), expected.vertex_normals)
     read = [_read(view, None if cameras is None else cameras[i], i, skin) for i, view in enumerate(views)]
-    read = [view for view in read if len(view.points) > max(NEIGHBOURS, neighbours)]
+    read = [view for view in read if len(view.points) > max(NEIGHBOURS, NORMAL_POINTS)]
     if sum(len(view.points) for view in read) < 60:  # fewer points show nothing
         return None
-    parts = [_orient(view, count // len(read), neighbours, skin) for view in read]
+    parts = [_orient(view, count // len(read), skin) for view in read]
     points, normals = (np.concatenate([part[i] for part in parts]) for i in (0, 1))
     dense = np.concatenate([part[2] for part in parts])
     # borders are those of all views together
-    border, spacing = _borders(points, normals, dense, neighbours)
+    border, spacing = _borders(points, normals, dense)
     number = np.repeat(np.arange(len(parts)), [len(part[0]) for part in parts])
     # the points were spread evenly above
     even = np.full(len(points), spacing**2)
@@ -107,8 +107,7 @@ def _faces_as(skin: _Skin, view: Mesh) -> bool:
     return 2 * near.sum() > len(seen) and float(agree.mean()) >= AGREE
 
 
-def _orient(view: _Points, count: int, neighbours: int, skin: _Skin | None
-            ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _orient(view: _Points, count: int, skin: _Skin | None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return some points of a view, their normals, and the denser points that gave the normals."""
     denser = 4  # normals come from four times as many points as are matched
     many = spread_points(view.points,
@@ -116,7 +115,7 @@ def _orient(view: _Points, count: int, neighbours: int, skin: _Skin | None
     dense = view.points[many]
     chosen = spread_points(dense, count) if len(dense) > count else np.arange(len(dense))
     # the normal is the direction of least spread of the neighbours
-    _, near = cKDTree(dense).query(dense[chosen], neighbours)
+    _, near = cKDTree(dense).query(dense[chosen], NORMAL_POINTS)
     around = dense[near] - _middles(dense, near)[:, None]
     normals = np.linalg.eigh(np.swapaxes(around, 1, 2) @ around)[1][:, :, 0]
     # a direction outward, for the sign
@@ -132,10 +131,9 @@ def _orient(view: _Points, count: int, neighbours: int, skin: _Skin | None
     return dense[chosen], normals, dense
 
 
-def _borders(points: np.ndarray, normals: np.ndarray, dense: np.ndarray, neighbours: int
-             ) -> tuple[np.ndarray, float]:
+def _borders(points: np.ndarray, normals: np.ndarray, dense: np.ndarray) -> tuple[np.ndarray, float]:
     """Find border points (n,), whose neighbours are all on one side, and the median spacing, metres."""
-    distance, near = cKDTree(dense).query(points, neighbours)
+    distance, near = cKDTree(dense).query(points, NORMAL_POINTS)
     mean = _middles(dense, near) - points
     mean -= np.einsum("nd,nd->n", mean, normals)[:, None] * normals
     # 0.35: at a border the mean of the neighbours is that far off, as a share of their reach
