@@ -26,7 +26,7 @@ from completion.mocap.files.markers import MarkerFileError, read_marker_points
 from completion.mocap.labelling import recording
 from completion.mocap.labelling.corrections import COLUMNS, read_corrections, write_labels
 from completion.mocap.labelling.label import GHOST, UNKNOWN
-from completion.mocap.labelling.recording import columns_of_labels, pack_tracks
+from completion.mocap.labelling.recording import columns_of_labels
 from completion.mocap.labelling.tracks import link_points
 from completion.mocap.mosh import cli as mosh_cli
 from completion.mocap.mosh.call import MoshCall
@@ -165,25 +165,6 @@ def test_whole_numbers_and_other_counts(here):
     for wrong in (source[:3], source + 3):
         with pytest.raises(MarkerFileError, match="expected a file of"):
             rename_points(folder / "whole.c3d", data, ["E", "D", "none", "A"], wrong)
-
-
-@pytest.mark.parametrize("seed", range(4))
-def test_loose_tracks_take_as_few_columns_as_can_be(seed):
-    rng = np.random.default_rng(seed)
-    tracks = np.full((60, 12), -1)
-    for number, (column, begin) in enumerate((c, b) for c in range(12) for b in (0, 30)):
-        length = rng.integers(1, 30)
-        tracks[begin:begin + length, column] = number
-    wanted = (tracks >= 0) & (rng.random(24)[tracks] < 0.7)
-    packed = pack_tracks(tracks, wanted)
-    frames, columns = np.nonzero(packed >= 0)
-    assert sorted(zip(frames.tolist(), packed[frames, columns].tolist(), strict=True)) == sorted(
-        map(tuple, np.argwhere(wanted).tolist()))
-    assert packed.shape[1] == wanted.sum(axis=1).max()               # no track has a hole here
-    for column in packed.T:
-        numbers = tracks[np.arange(60), column][column >= 0]
-        assert (np.diff(np.flatnonzero(np.r_[True, np.diff(numbers) != 0])) > 0).all()
-        assert len(np.unique(numbers)) == 1 + (np.diff(numbers) != 0).sum()          # each in one piece
 
 
 def test_the_table_says_what_was_found_and_gives_it_back(here):

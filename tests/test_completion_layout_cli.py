@@ -11,7 +11,6 @@ from completion.mocap.marker_sets import pictures, transfer
 from completion.mocap.marker_sets.layout import MarkerLayout
 from completion.mocap.marker_sets.named import layout_names, load_layout, read_layout
 from completion.mocap.marker_sets.opensim import opensim_markers
-from completion.mocap.marker_sets.pictures import layout_rows, picture_layout
 from model.fitting.bodies import at_rest
 from scanprep import read_mesh, write_landmarks, write_mesh
 from scanprep.geometry.landmark_reading import read_marker_set
@@ -97,22 +96,6 @@ def test_markers_are_on_the_bodies_of_opensim():
         assert apart == pytest.approx(np.linalg.norm(places[shin] - places[ankle]))
     with pytest.raises(ValueError, match="person's parts"):
         opensim_markers(layout, body, replace(skeleton, names=tuple(f"part{j}" for j in range(len(skeleton.names)))))
-
-
-def test_the_picture_shows_every_marker(person):
-    layout = load_layout("helenhayes29", person.mesh)
-    bare = MarkerLayout(layout.labels[:1], layout.vertices[:1])
-    full, one = (picture_layout(person.mesh, x, 220).astype(int) for x in (layout, bare))
-    assert full.shape == one.shape and full.shape[0] > 220
-    assert (np.abs(full - one).sum(axis=2) > 60).sum() > 28 * 25         # balls and words that only one of them has
-
-
-def test_the_table_has_partners_and_parts(person):
-    layout = load_layout("cmu41", person.mesh)
-    rows = {row[0]: row for row in layout_rows(person.mesh, layout, person.skeleton)}
-    assert rows["LELB"][3] == "RELB" and rows["C7"][3] == "middle" and rows["RBAC"][3] == "-"
-    assert rows["LTHI"][2] == "thigh_left" and rows["LTHI"][5] == "loose" and rows["LWRA"][4] == "45.0 mm"
-    assert "RBAK" in rows["RBAC"][1]
 
 
 @pytest.mark.slow

@@ -10,7 +10,6 @@ from completion.partial.completion import complete
 from completion.partial.masks import read_mask
 from model.fitting.free_space import Clothing
 from model.fitting.scan import prepare_scan
-from model.fitting.scan_fit import part_vertices
 from scanprep.geometry.files import PointCloud, write_mesh, write_points
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.surface import Surface
@@ -44,17 +43,6 @@ def test_the_body_is_inside_its_clothes(model, body, dressed):
     assert off[0].mean() < 0.006 and off[0].mean() < 0.6 * off[1].mean()
     assert aware.explained > 0.97                                    # of the points that are not cloth
     assert aware.seen.mean() < naive.seen.mean()
-
-
-def test_masked_points_are_set_apart_and_still_seen(dressed):
-    points, cloth, _ = dressed
-    scan = prepare_scan(points, masked=cloth)
-    np.testing.assert_array_equal(scan.points, points[~cloth])
-    np.testing.assert_array_equal(scan.masked.points, points[cloth])
-    np.testing.assert_array_equal(np.sort(scan.everything.index), np.arange(len(points)))
-    whole = prepare_scan(points)
-    np.testing.assert_array_equal(whole.normals[cloth], scan.masked.normals)
-    assert prepare_scan(points, masked=0 * cloth > 1).masked is None
 
 
 def test_what_sticks_out_of_clothing_is_pushed_in():
@@ -93,18 +81,6 @@ def test_parts_that_are_left_out_are_not_matched(model, body):
     off = [np.linalg.norm(r.completed.vertices - body.vertices, axis=1)[rest].mean() for r in (wrong, right)]
     assert off[1] < 0.006 and off[1] < off[0]
     assert right.seen[part == 3].mean() < 0.5 * wrong.seen[part == 3].mean()
-
-
-def test_parts_have_names(model):
-    names = model.skeleton.names
-    part = model.skeleton.part_of_vertex(model.template)
-    np.testing.assert_array_equal(part_vertices(model.template, model.skeleton, (names[1], names[3])),
-                                  (part == 1) | (part == 3))
-    assert not part_vertices(model.template, model.skeleton, ()).any()
-    with pytest.raises(ValueError, match=f"ignored_parts: expected names of {names[0]}, .*; got tail, fin"):
-        part_vertices(model.template, model.skeleton, ("tail", names[0], "fin"))
-    with pytest.raises(ValueError, match="leave some parts of the body"):
-        part_vertices(model.template, model.skeleton, tuple(names))
 
 
 # ---- files
@@ -149,12 +125,6 @@ def test_masks_of_every_kind_say_the_same(tmp_path):
 def test_a_mask_that_cannot_be_read_says_why(tmp_path, name, text, message):
     (tmp_path / name).write_text(text)
     with pytest.raises(ValueError, match=f"{name}: .*{message}" if "line" not in message else f"{name}: {message}"):
-        read_mask(tmp_path / name, POINTS)
-
-
-@pytest.mark.parametrize("name", ["none.npy", "none.json", "none.txt", "none.ply"])
-def test_a_mask_that_is_missing_is_named(tmp_path, name):
-    with pytest.raises(ValueError, match=f"{name}: no such file"):
         read_mask(tmp_path / name, POINTS)
 
 

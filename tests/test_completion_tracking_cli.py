@@ -18,7 +18,6 @@ from trees import tree
 from completion import Motion
 from completion.tracking import cli, report
 from completion.tracking.folder import FrameFolder
-from completion.tracking.report import _ranges
 from completion.tracking.sequence import BodyTracker
 from model import load_model
 from scanprep.batch.workspace import HOME
@@ -84,10 +83,6 @@ def test_a_bad_file_is_a_camera_that_saw_nothing_and_is_named_once(tmp_path):
     found = FrameFolder(tmp_path)
     assert [len(views) for views in found] == [1, 0, 1, 0] and not found[1]
     assert len(found.problems) == 1 and "2.ply" in found.problems[0]
-
-
-def test_runs_of_numbers_are_told_as_ranges():
-    assert _ranges(np.array([3, 4, 5, 9, 11, 12])) == "3 to 5, 9, 11 to 12"
 
 
 @pytest.fixture(scope="module")
@@ -200,14 +195,6 @@ def test_a_changed_frame_is_followed_anew_with_those_after_it(again):
         "surfaces/000007.ply", "surfaces/000008.ply"}
     assert track(*arguments(folder, out.with_name("anew"), *KNOWN)) == 0
     assert contents(out) == contents(out.with_name("anew"))
-
-
-def test_damaged_frames_are_followed_again_and_nothing_else(again):
-    folder, out, numbers = again
-    before, kept = contents(out), out / HOME / "done" / "frames%2F00000000.npz"
-    kept.write_bytes(kept.read_bytes()[:-200])
-    assert track(*arguments(folder, out, *KNOWN)) == 0
-    assert numbers == [0, 1, 2, 3, 4] and contents(out) == before
 
 
 def test_a_shorter_recording_leaves_nothing_behind(again):

@@ -10,7 +10,7 @@ from completion.partial.completion import complete
 from model.fitting.bodies import as_body
 from model.fitting.free_space import find_cameras, free_space_violation
 from model.fitting.scale import LOOSE, ScaledBody, landmark_scale, rough_scale
-from model.fitting.scan import as_views, prepare_scan
+from model.fitting.scan import prepare_scan
 from scanprep.geometry.files import PointCloud
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.surface import Surface
@@ -129,11 +129,6 @@ def test_normals_of_mixed_sign_are_turned_outward_and_missing_ones_estimated(bod
 def test_views_that_cannot_be_used_are_refused(scan, viewpoint, message):
     with pytest.raises(ValueError, match=message):
         prepare_scan(scan, viewpoint)
-
-
-def test_lists_of_numbers_are_one_view():
-    assert [view.shape for view in as_views([[0, 0, 1], [1, 2, 3]])] == [(2, 3)]
-    assert len(as_views([np.zeros((2, 3)), np.zeros((4, 3))])) == 2
 
 
 # ---- scans of unknown unit

@@ -7,17 +7,14 @@ import re
 import shutil
 from contextlib import contextmanager
 from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from browser import wait_until
 from quiet_pictures import coarse_pictures
 from scene_reader import scenes_of
 
 from completion import Motion
 from completion.demo import chain, cli
-from completion.demo import figures as measuring
 from completion.demo.chain import QUICK, USUAL, Demo
 from completion.viewing.files import Files
 from model import load_model
@@ -135,14 +132,6 @@ def slid_poses(mesh, poses, size, rng):
 
 
 @pytest.mark.slow
-def test_more_of_the_first_component_is_more_volume(demo_folder):
-    model = load_model(demo_folder / "model.npz")
-    rest = np.zeros((len(model.skeleton.parents), 3))
-    volumes = [model.template.with_vertices(model.vertices(rest, np.array([beta]))).volume for beta in (-1.5, 0, 1.5)]
-    assert volumes[0] < volumes[1] < volumes[2]
-
-
-@pytest.mark.slow
 def test_one_number_for_one_thing(figures, demo_folder):
     """The worst scan is as far from the truth on the page as in the report; the verdict stands before all figures."""
     page = (demo_folder / "report.html").read_text(encoding="utf-8")
@@ -192,17 +181,6 @@ def test_page_stands_alone(small_demo):
 
 
 @pytest.mark.slow
-def test_every_figure_of_the_page_turns(small_demo, new_page):
-    page = new_page(offline=True)
-    page.goto((small_demo / "report.html").as_uri())
-    figures = page.locator("figure[data-scene]")
-    for number in range(figures.count()):
-        figures.nth(number).scroll_into_view_if_needed()
-        wait_until(page, f"'turns' in document.querySelectorAll('figure[data-scene]')[{number}].dataset", 60)
-    assert not page.errors and len(page.requests) == 1
-
-
-@pytest.mark.slow
 def test_goes_on_where_it_was(small_demo, tmp_path):
     """Without the model and the page, a second run makes these again, the same, and touches nothing before them."""
     folder = tmp_path / "again"
@@ -230,39 +208,6 @@ def files(folder, *but):
             if p.is_file() and ".scapekit" not in p.parts and p.name not in but}
 
 
-@pytest.fixture
-def counted():
-    """Calls of the long stages after the scans, of the small demonstration."""
-    calls = {name: 0 for name in ("template_of_views", "prepare", "learn_scape", "complete", "record_walk", "animate")}
-
-    def count(name, real):
-        def counting(*given, **named):
-            calls[name] += 1
-            return real(*given, **named)
-        return counting
-
-    with small(), pytest.MonkeyPatch.context() as patch:
-        for name in calls:
-            patch.setattr(chain, name, count(name, getattr(chain, name)))
-        yield calls
-
-
-@pytest.mark.slow
-def test_another_setting_does_anew_what_depends_on_it(small_demo, tmp_path, counted):
-    """Another rate of the markers: another recording and another motion, and nothing else."""
-    folder = tmp_path / "again"
-    shutil.copytree(small_demo, folder)
-    before = files(folder)
-    with workspace(folder) as space:
-        measuring.measure_demo(Demo(space, replace(SMALL, rate=33.0), 0, console.bar))
-    changed = {name for name, data in files(folder).items() if before[name] != data}
-    done = {name: calls for name, calls in counted.items() if calls}
-    # `prepare` looks for itself what is to be done
-    assert done == {"prepare": 1, "record_walk": 1, "animate": 1}
-    assert changed >= {"markers/walk.c3d", "animation/motion.npz"}
-    assert not [name for name in changed if name.startswith(("scans/", "set/meshes", "template", "model", "comp"))]
-
-
 TINY = replace(QUICK, poses=3, subjects=2, resolution=0.03)
 
 
@@ -281,28 +226,6 @@ def test_fewer_scans_of_another_person_leave_no_old_one(tmp_path):
     again = {p: p.stat().st_mtime_ns for p in (tmp_path / "a" / "scans").rglob("*.ply")}
     scans(tmp_path / "a", *other)
     assert again == {p: p.stat().st_mtime_ns for p in (tmp_path / "a" / "scans").rglob("*.ply")}
-
-
-def test_a_set_with_more_scans_becomes_one_with_fewer(tmp_path, monkeypatch):
-    """Registered here without any effort: what is kept of the set matters."""
-    monkeypatch.setattr(chain, "prepare", lambda tasks, *_: prepared([t.name for t in tasks]))
-    held = []
-
-    def prepared(names):
-        held.append(sorted(space.list_results(chain.SCANS)))
-        with space.staging("tables") as staged:
-            (staged.folder / "set.csv").write_text("\n".join(names))
-        for name in names:
-            with space.staging(chain.SCANS + name):
-                pass
-        return SimpleNamespace(failures=())
-
-    for config in (TINY, replace(TINY, poses=2)):
-        with workspace(tmp_path) as outer, workspace(tmp_path / "set") as space:
-            demo = Demo(outer, config, 0, console.bar)
-            demo.__dict__.update(template=None, template_landmarks={})
-            assert demo.prepared
-    assert len(held[1]) == 4 and not held[0]
 
 
 def test_a_bad_seed_leaves_the_folder_as_it_was(tmp_path, capsys):

@@ -48,7 +48,7 @@ from ..mocap.marker_sets.layout import DISTANCE, MarkerLayout
 from ..mocap.pose.follow import animate
 from ..motion import Motion
 from ..partial.completion import Completion, complete, load_completion
-from .sample import MARKER_NOISE, record_markers
+from .sample import record_markers
 from .truth import TruthMap, distance, surface_error
 
 
@@ -225,71 +225,70 @@ class Demo:
         return fit_pose(self.subject, wanted).vertices
 
     @cached_property
+    def unseen(self) -> Path:
+        """The folder, with what the model makes of people whom it never saw: a half view completed, a walk followed."""
+        self.space.step("unseen", (self.folder / MODEL, self.template_landmarks, self.amounts, self.seed),
+                        self._make_unseen)
+        return self.folder
+
+    def _make_unseen(self, folder: Path) -> None:
+        """Scan a held-out pose from one side, complete it, record a walk and follow its markers."""
+        # what one camera sees of the first held-out pose, with seven landmarks that somebody clicks
+        truth, rng = self.held_out[0], np.random.default_rng([self.seed, 8])
+        seen = scan(truth.mesh, replace(self.scanner, views=1, azimuth=-30.0), rng)
+        marks = click_landmarks(truth, rng, seen=seen.merged.vertices)
+        chosen = np.array(list(marks))[spread_indices(len(marks), 7)]
+        write_scan(folder / HALF.parent, HALF.stem, seen, truth, {name: marks[name] for name in chosen}, views=False)
+        # the whole body from it
+        half, marks = _read_half(folder)
+        _, vertices, points = match_landmarks(self.template_landmarks, marks)
+        with self.bar("completing a half view") as progress:
+            complete(self.subject, half, (vertices, points), progress=progress).save(folder / "completed")
+        # a walk; as with a real subject, the layout is read from the scan at rest, on which the markers are visible
+        with self.bar("recording a walk") as progress:
+            sequence = record_markers(self.walking, self.rest.faces, self.amounts.rate,
+                                      np.random.default_rng([self.seed, 9]), progress)
+        _, vertices = cKDTree(self.template.vertices).query(self.rest.vertices[list(MARKERS.values())])
+        MarkerLayout(tuple(MARKERS), vertices, DISTANCE).save(folder / "markers" / "layout.json")
+        write_markers(folder / "markers" / "walk.c3d", sequence)
+        # the motion that follows its markers
+        with self.bar("following the markers") as progress:
+            motion = animate(self.subject, read_markers(folder / "markers" / "walk.c3d"),
+                             MarkerLayout.load(folder / "markers" / "layout.json"), progress=progress)
+        motion.save(folder / MOTION, **skeleton_arrays(self.subject.rest_skeleton))
+
+    @cached_property
     def half_scan(self) -> tuple[Mesh, dict[str, np.ndarray], GroundTruth]:
         """What one camera sees of the first held-out pose, a few landmarks on it, and the truth."""
-        truth, scanner = self.held_out[0], replace(self.scanner, views=1, azimuth=-30.0)
-
-        landmarks = 7  # number that somebody clicks on the half view
-        def make(folder: Path) -> None:
-            rng = np.random.default_rng([self.seed, 8])
-            seen = scan(truth.mesh, scanner, rng)
-            marks = click_landmarks(truth, rng, seen=seen.merged.vertices)
-            chosen = spread_indices(len(marks), landmarks)
-            write_scan(folder / HALF.parent, HALF.stem, seen, truth,
-                       {name: marks[name] for name in np.array(list(marks))[chosen]}, views=False)
-
-        self.space.step("half view", (self.seed, scanner, landmarks), make)
-        half = self.folder / HALF
-        return read_mesh(half), read_landmarks(half.with_suffix(".landmarks.json")), truth
+        return *_read_half(self.unseen), self.held_out[0]
 
     @cached_property
     def completion(self) -> Completion:
         """The whole body from the half view."""
-        half, marks, _ = self.half_scan
-        subject = self.subject
-
-        def make(folder: Path) -> None:
-            _, vertices, points = match_landmarks(self.template_landmarks, marks)
-            with self.bar("completing a half view") as progress:
-                complete(subject, half, (vertices, points), progress=progress).save(folder / "completed")
-
-        self.space.step("completion", (self.folder / MODEL, self.folder / HALF, self.template_landmarks, marks), make)
-        return load_completion(self.folder / "completed")
+        return load_completion(self.unseen / "completed")
 
     @cached_property
-    def walk(self) -> tuple[MarkerSequence, MarkerLayout, np.ndarray]:
-        """Markers of the walking subject, their places on the template, and the true vertices (T, N, 3)."""
-        amounts, seed, template = self.amounts, self.seed, self.template
-        poses, trans = synthesise_walk(amounts.frames, amounts.rate)
-        bodies = np.stack([self.person.in_pose(pose, place) for pose, place in zip(poses, trans, strict=True)])
+    def walking(self) -> np.ndarray:
+        """The true vertices (T, N, 3) of the walk."""
+        poses, trans = synthesise_walk(self.amounts.frames, self.amounts.rate)
+        return np.stack([self.person.in_pose(pose, place) for pose, place in zip(poses, trans, strict=True)])
 
-        def make(folder: Path) -> None:
-            with self.bar("recording a walk") as progress:
-                sequence = record_markers(bodies, self.rest.faces, amounts.rate, np.random.default_rng([seed, 9]),
-                                          progress)
-            # as with a real subject, the layout is read from the scan at rest, on which the markers are visible
-            _, vertices = cKDTree(template.vertices).query(self.rest.vertices[list(MARKERS.values())])
-            MarkerLayout(tuple(MARKERS), vertices, DISTANCE).save(folder / "markers" / "layout.json")
-            write_markers(folder / "markers" / "walk.c3d", sequence)
-
-        self.space.step("markers", (seed, amounts.frames, amounts.rate, MARKER_NOISE, template), make)
-        layout = MarkerLayout.load(self.folder / "markers" / "layout.json", len(template.vertices))
-        return read_markers(self.folder / "markers" / "walk.c3d"), layout, bodies
+    @cached_property
+    def walk(self) -> MarkerSequence:
+        """The markers of the walking subject."""
+        return read_markers(self.unseen / "markers" / "walk.c3d")
 
     @cached_property
     def motion(self) -> Motion:
         """The model's motion that follows the markers of the walk."""
-        (sequence, layout, _), subject = self.walk, self.subject
-
-        def make(folder: Path) -> None:
-            with self.bar("following the markers") as progress:
-                motion = animate(subject, sequence, layout, progress=progress)
-            motion.save(folder / MOTION, **skeleton_arrays(subject.rest_skeleton))
-
-        self.space.step("animation", (self.folder / MODEL, self.folder / "markers"), make)
-        return Motion.load(self.folder / MOTION)
+        return Motion.load(self.unseen / MOTION)
 
     @cached_property
     def truth_map(self) -> TruthMap:
         """Where the template's vertices truly lie."""
         return TruthMap.of(self.template, self.rest)
+
+
+def _read_half(folder: Path) -> tuple[Mesh, dict[str, np.ndarray]]:
+    """Read the half view and its landmarks."""
+    return read_mesh(folder / HALF), read_landmarks((folder / HALF).with_suffix(".landmarks.json"))

@@ -35,9 +35,9 @@ def measure_demo(demo: Demo) -> list[Metric]:
                     MM * mean_over_area(surface, template, seen), "mm"),
              Metric("completion: share of the body that was seen", 100 * float(seen.mean()), "%", detail=True)]
     # the walk, followed by its markers
-    motion, (_, _, bodies), faces = demo.motion, demo.walk, demo.person.mesh.faces
+    motion, faces = demo.motion, demo.person.mesh.faces
     walked = [distance(body, at.places.transfer(true_body, faces))
-              for body, true_body in zip(motion.vertices(demo.subject), bodies, strict=True)]
+              for body, true_body in zip(motion.vertices(demo.subject), demo.walking, strict=True)]
     rows += [Metric("animation: mean error", MM * mean_over_area(np.mean(walked, axis=0), template), "mm"),
              Metric("animation: markers to their place on the body, mean", MM * float(np.nanmean(motion.residuals)),
                     "mm")]
@@ -61,7 +61,7 @@ def judge_demo(demo: Demo) -> Judgement:
     """Judge the demonstration: each result's own judgement, and names of parts."""
     folder = demo.folder / "set"
     set_of_scans = judge_whole(judge_set(folder), RegisteredSet.load(folder))
-    motion = Judgement.of(check=motion_doubts([demo.motion], [demo.walk[0]], demo.template))
+    motion = Judgement.of(check=motion_doubts([demo.motion], [demo.walk], demo.template))
     of_results = judge_many({"registration": set_of_scans, "model": judge_model(demo.model),
                              "completion": demo.completion.judgement, "animation": motion})
     lacking = [name for name in NAMED if name not in demo.model.skeleton.names]

@@ -142,8 +142,7 @@ def _completion(demo: Demo, page: Page) -> None:
 
 def _animation(demo: Demo, page: Page, to: Path) -> None:
     """Add the walk with its markers."""
-    sequence, _, _ = demo.walk
-    motion, subject = demo.motion, demo.subject
+    sequence, motion, subject = demo.walk, demo.motion, demo.subject
     page.section("Animation", f"{len(sequence.labels)} markers of a walk, 3% of them missing at any time, and the body "
                  "that follows them.")
     write_glb(to / "animation" / "walk.glb", motion, subject)
