@@ -24,7 +24,7 @@ from completion.mocap.files.c3d import point_table
 from completion.mocap.files.c3d_points import rename_points
 from completion.mocap.files.markers import MarkerFileError, read_marker_points
 from completion.mocap.labelling import recording
-from completion.mocap.labelling.corrections import COLUMNS, read_corrections, write_labels
+from completion.mocap.labelling.corrections import COLUMNS, read_corrections
 from completion.mocap.labelling.label import GHOST, UNKNOWN
 from completion.mocap.labelling.recording import columns_of_labels
 from completion.mocap.labelling.tracks import link_points
@@ -232,17 +232,6 @@ def test_a_wrong_table_is_refused(here, capsys, case):
     assert "wrong.csv" in said
     assert re.search(message, said), said
     assert not (folder / "other.c3d").exists()
-
-
-def test_rows_that_are_not_fixed_say_nothing(tmp_path):
-    tracks = np.array([[0, 1], [0, 1], [0, -1]])
-    write_labels(tmp_path / "t.csv", ["=a", "b"], tracks, np.array([[0, 1], [0, 1], [1, -1]]), ["A", "B"],
-                 np.array([[0.9, 0.5], [0.9, 0.5], [0.2, 0]]), np.array([[1, 0], [1, 0], [0, 0]], dtype=bool))
-    rows = rows_of(tmp_path / "t.csv")
-    assert [(r["track"], r["begin"], r["end"], r["label"], r["confidence"], r["fixed"]) for r in rows] == [
-        ("0", "2", "2", "B", "0.2", ""), ("1", "0", "1", "B", "0.5", ""), ("0", "0", "1", "A", "0.9", "yes")]
-    np.testing.assert_array_equal(read_corrections(tmp_path / "t.csv", tracks, ["A", "B"]),
-                                  [[0, UNKNOWN], [0, UNKNOWN], [UNKNOWN, UNKNOWN]])
 
 
 def test_labels_that_the_recording_has_are_believed_unless_asked(here):

@@ -96,20 +96,6 @@ def test_a_model_with_the_ten_landmarks_of_the_readme_is_measured(folder, tmp_pa
         assert float(ten[name]) == pytest.approx(float(full[name]), abs=0.012), name
 
 
-@pytest.mark.slow
-def test_a_set_made_without_landmarks_is_measured(tmp_path):
-    """Its landmark file is empty: all are looked for, and on the built-in people they are known."""
-    person = SyntheticPerson().mesh
-    RegisteredSet.create(tmp_path / "set", person).add("anna", person)
-    (tmp_path / "set" / "landmarks.json").write_text("{}")
-    (tmp_path / "none.json").write_text("{}")
-    for name, words in (("set", ()), ("file", ("--landmarks", tmp_path / "none.json"))):
-        assert scape(tmp_path / "set", *words, "-o", tmp_path / f"{name}.csv") == 0
-        row = table(tmp_path / f"{name}.csv")["anna"]
-        assert float(row["stature"]) == pytest.approx(np.ptp(person.vertices[:, 2]) + 0.005, abs=0.002)  # legs straight
-        assert all(float(row[f"{c}_error"]) > 0 for c in CATALOGUE)
-
-
 def test_a_registered_half_view_is_less_known_than_a_whole_scan(tmp_path):
     """By the share of the surface that `registration.csv` says has data; four views leave 15% without."""
     person = SyntheticPerson().mesh
@@ -224,22 +210,7 @@ def test_a_hole_leaves_a_cell_empty(folder, tmp_path, capsys):
 
 
 @pytest.mark.slow
-def test_percentiles_of_a_sex(folder, tmp_path, capsys):
-    """The table, the figures and the page compare with the survey; without --sex nothing of it is there."""
-    assert scape(folder / "bodies" / "rest.ply", "-m", folder / "model.npz", "--sex", "male", "-o",
-                 tmp_path / "m.csv") == 0
-    row = table(tmp_path / "m.csv")["rest"]
-    true = percentiles({"stature": float(row["stature"]), "thigh_girth_left": float(row["thigh_girth_left"])}, "male")
-    assert float(row["stature_percentile"]) == pytest.approx(true["stature"], abs=0.3)
-    assert float(row["thigh_girth_left_percentile"]) == pytest.approx(true["thigh_girth_left"], abs=0.3)
-    assert "knee_girth_left_percentile" not in row, "the survey has none"
-    assert "of men" in capsys.readouterr().out
-    page = (tmp_path / "m.html").read_text(encoding="utf-8")
-    assert f"({ordinal(true['stature'])})" in page and "4,082 men of ANSUR II" in page
-
-
-@pytest.mark.slow
-def test_the_weight_of_a_closed_body_is_told_with_its_error(folder, tmp_path, capsys):
+def test_percentiles_of_a_sex_and_the_weight_of_a_closed_body(folder, tmp_path, capsys):
     """985 kg in a cubic metre, give or take 2%; an open one has none, and is good all the same."""
     model = small_people()
     body = model.template.with_vertices(model.vertices(np.zeros((16, 3))))
@@ -251,6 +222,12 @@ def test_the_weight_of_a_closed_body_is_told_with_its_error(folder, tmp_path, ca
     assert spread < float(row["weight_error"]) < np.hypot(spread, skin)
     assert float(row["weight_percentile"]) == pytest.approx(
         percentiles({"weight": float(row["weight"])}, "male")["weight"], abs=0.1)
+    true = percentiles({"stature": float(row["stature"])}, "male")
+    assert float(row["stature_percentile"]) == pytest.approx(true["stature"], abs=0.3)
+    assert "knee_girth_left_percentile" not in row, "the survey has none"
+    assert "of men" in capsys.readouterr().out
+    page = (tmp_path / "m.html").read_text(encoding="utf-8")
+    assert f"({ordinal(true['stature'])})" in page and "4,082 men of ANSUR II" in page
     crown = int(body.vertices[:, 2].argmax())
     write_mesh(tmp_path / "bald.ply", type(body)(body.vertices, body.faces[~(body.faces == crown).any(axis=1)]))
     capsys.readouterr()

@@ -1,12 +1,6 @@
 import json
-import os
 import shutil
-import signal
-import subprocess
-import sys
-import time
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -124,31 +118,6 @@ def test_the_command_writes_all_it_promises(recording, output):
     surfaces = sorted((output / "surfaces").iterdir())
     assert [p.name for p in surfaces] == [f"{i:06d}.ply" for i in range(FRAMES)]
     assert len(read_mesh(surfaces[0], "m").faces) == len(model.template.faces)
-
-
-@pytest.mark.slow
-def test_killed_in_the_first_frames_and_started_again(recording, tmp_path, capfd, monkeypatch):
-    """The shape is found from frames of two chunks; the run is killed after the first."""
-    monkeypatch.setattr(report, "track_page", quick_page)
-    out, shaped = tmp_path / "out", ("--shape-frames", 7)
-    assert call(recording, tmp_path / "whole", *shaped) == 0
-    program = [sys.executable, str(Path(__file__).with_name("recordings.py")), *arguments(recording[0], out, *shaped)]
-    child = subprocess.Popen(program, start_new_session=True, stderr=subprocess.DEVNULL)
-    deadline = time.monotonic() + 120
-    while not (out / HOME / "done" / "frames%2F00000000.npz").exists():
-        assert child.poll() is None and time.monotonic() < deadline
-        time.sleep(0.005)
-    os.kill(child.pid, signal.SIGSTOP)                  # it still holds the output
-    capfd.readouterr()
-    assert call(recording, out, *shaped) == 1 and "another run is at work" in capfd.readouterr().err
-    os.kill(child.pid, signal.SIGKILL)
-    child.wait()
-    assert not (out / "motion.npz").exists()
-    assert call(recording, out, *shaped) == 0
-    assert f"5 of {FRAMES} frames were tracked before" in capfd.readouterr().err
-    assert contents(out) == contents(tmp_path / "whole")
-    betas = Motion.load(out / "motion.npz").betas
-    assert betas.shape == (3,) and np.abs(betas).max() > 0
 
 
 @pytest.fixture

@@ -173,7 +173,7 @@ def test_page_stands_alone(small_demo):
     page = (small_demo / "report.html").read_text(encoding="utf-8")
     assert not re.findall(r'(?:src|href)="(?!data:|#)[^"]*"', page)
     scenes = scenes_of(page)
-    assert len(scenes) == 9 and len(page) < 4_000_000 and "animation/walk.glb" in page
+    assert len(scenes) == 8 and len(page) < 4_000_000 and "animation/walk.glb" in page
     assert scenes[-1].layer("body")["motion"]["frames"] == 66
     for stage in ("Scans", "Template", "Registration", "Skeleton", "Body shape", "Completion", "Animation"):
         assert re.search(rf"<h2[^>]*>{stage}</h2>", page)

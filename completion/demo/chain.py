@@ -24,6 +24,7 @@ from scanprep.geometry.farthest_points import spread_indices
 from scanprep.geometry.files import read_mesh, write_mesh
 from scanprep.geometry.landmarks import match_landmarks, read_landmark_vertices, read_landmarks, write_landmarks
 from scanprep.geometry.mesh import Mesh
+from scanprep.geometry.surface import Surface, SurfacePoints
 from scanprep.pipeline.again import Call
 from scanprep.pipeline.prepare import SCANS, Prepared, prepare
 from scanprep.pipeline.scans import TABLE, find_scans
@@ -49,7 +50,7 @@ from ..mocap.pose.follow import animate
 from ..motion import Motion
 from ..partial.completion import Completion, complete, load_completion
 from .sample import record_markers
-from .truth import TruthMap, distance, surface_error
+from .truth import distance, surface_error
 
 
 @dataclass(frozen=True)
@@ -206,7 +207,7 @@ class Demo:
         """By scan: distances (N,), metres, of every registered vertex to the true surface, and to its true place."""
         registered, truths = self.prepared.registered, {s.name: GroundTruth.load(s.truth) for s in self.scans}
         return {name: (surface_error(self.template.with_vertices(vertices), truths[name]),
-                       distance(vertices, self.truth_map.vertices(truths[name])))
+                       distance(vertices, self.true_places(truths[name])))
                 for name, vertices in zip(registered.names, registered.vertices(), strict=True)}
 
     @cached_property
@@ -284,9 +285,13 @@ class Demo:
         return Motion.load(self.unseen / MOTION)
 
     @cached_property
-    def truth_map(self) -> TruthMap:
-        """Where the template's vertices truly lie."""
-        return TruthMap.of(self.template, self.rest)
+    def places(self) -> SurfacePoints:
+        """The true surface points nearest to the template's vertices; all people share one triangulation."""
+        return Surface(self.rest.mesh).closest(self.template.vertices)
+
+    def true_places(self, truth: GroundTruth) -> np.ndarray:
+        """Compute the true places (N, 3) of the template's vertices on a person, metres."""
+        return self.places.transfer(truth.vertices, truth.faces)
 
 
 def _read_half(folder: Path) -> tuple[Mesh, dict[str, np.ndarray]]:

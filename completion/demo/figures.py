@@ -8,6 +8,7 @@ from model.learning.scape import judge_model
 from scanprep.cli import MM
 from scanprep.console import Metric
 from scanprep.dataset import RegisteredSet
+from scanprep.geometry.surface import Surface
 from scanprep.judgement import Judgement, judge_many
 from scanprep.pipeline.page import judge_set, judge_whole
 
@@ -20,14 +21,14 @@ NAMED = ("head", "hand_left", "hand_right", "foot_left", "foot_right")     # par
 
 def measure_demo(demo: Demo) -> list[Metric]:
     """Run the stages that have not been run, and measure them; errors on unseen data come first."""
-    template, at = demo.template, demo.truth_map
+    template = demo.template
     # held-out poses, which the model never saw
-    wanted = [at.vertices(truth) for truth in demo.held_out]
+    wanted = [demo.true_places(truth) for truth in demo.held_out]
     error = [mean_over_area(distance(demo.fit_pose(w), w), template) for w in wanted]
     rows = [Metric(f"model: {len(wanted)} poses it never saw, mean error", MM * float(np.mean(error)), "mm")]
     # the completed half view, separately for surface that was seen and that was hidden
     done, (half, _, truth) = demo.completion, demo.half_scan
-    surface, true = surface_error(done.completed, truth), at.vertices(truth)
+    surface, true = surface_error(done.completed, truth), demo.true_places(truth)
     apart = distance(done.completed.vertices, true)
     seen = cKDTree(half.vertices).query(true)[0] < 2 * demo.amounts.resolution
     rows += [Metric("completion, hidden: mean error", MM * mean_over_area(apart, template, ~seen), "mm"),
@@ -36,7 +37,7 @@ def measure_demo(demo: Demo) -> list[Metric]:
              Metric("completion: share of the body that was seen", 100 * float(seen.mean()), "%", detail=True)]
     # the walk, followed by its markers
     motion, faces = demo.motion, demo.person.mesh.faces
-    walked = [distance(body, at.places.transfer(true_body, faces))
+    walked = [distance(body, demo.places.transfer(true_body, faces))
               for body, true_body in zip(motion.vertices(demo.subject), demo.walking, strict=True)]
     rows += [Metric("animation: mean error", MM * mean_over_area(np.mean(walked, axis=0), template), "mm"),
              Metric("animation: markers to their place on the body, mean", MM * float(np.nanmean(motion.residuals)),
@@ -46,7 +47,8 @@ def measure_demo(demo: Demo) -> list[Metric]:
     slid = [mean_over_area(off, template) for _, off in demo.off.values()]
     worst = max(means, key=means.__getitem__)
     skeleton = demo.model.skeleton
-    agreement = rand_index(skeleton.part_of_face, at.part_of_face, template.face_areas)
+    true_faces = Surface(demo.rest.mesh).closest(template.corners.mean(axis=1)).faces
+    agreement = rand_index(skeleton.part_of_face, demo.rest.part_of_face[true_faces], template.face_areas)
     return [*rows, Metric(f"registration: {len(means)} scans, mean distance to the true surface",
                           MM * float(np.mean(list(means.values()))), "mm"),
             Metric(f"registration: the same, worst scan ({worst})", MM * means[worst], "mm"),

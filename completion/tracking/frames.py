@@ -3,7 +3,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -29,11 +29,8 @@ class _Points:
     viewpoint: np.ndarray | None
 
 
-class _Skin(NamedTuple):
-    """The expected body: a search tree of its vertices, and their normals (N, 3)."""
-
-    tree: cKDTree
-    normals: np.ndarray
+# the expected body: a search tree of its vertices, and their normals (N, 3)
+_Skin = tuple[cKDTree, np.ndarray]
 
 
 def prepare_frame(frame: Frame, count: int, viewpoints: Any = None, expected: Mesh | None = None) -> ScanPoints | None:
@@ -46,7 +43,7 @@ def prepare_frame(frame: Frame, count: int, viewpoints: Any = None, expected: Me
     # read the views, each with its camera; views with too few points for a normal are left out
     views = [] if frame is None else [frame] if isinstance(frame, Mesh | PointCloud | np.ndarray) else list(frame)
     cameras = None if viewpoints is None else np.broadcast_to(np.asarray(viewpoints, float), (len(views), 3))
-    skin = None if expected is None else _Skin(cKDTree(expected.vertices), expected.vertex_normals)
+    skin = None if expected is None else (cKDTree(expected.vertices), expected.vertex_normals)
     read = [_read(view, None if cameras is None else cameras[i], i, skin) for i, view in enumerate(views)]
     read = [view for view in read if len(view.points) > max(NEIGHBOURS, NORMAL_POINTS)]
     if sum(len(view.points) for view in read) < 60:  # fewer points show nothing
@@ -101,9 +98,10 @@ def _faces_as(skin: _Skin, view: Mesh) -> bool:
     # normals of these triangles
     normals = np.cross(corners[seen, 1] - corners[seen, 0], corners[seen, 2] - corners[seen, 0])
     # compared with the normal at the nearest vertex of the body
-    far, nearest = skin.tree.query(middle[seen], distance_upper_bound=CLOSE)
+    tree, skin_normals = skin
+    far, nearest = tree.query(middle[seen], distance_upper_bound=CLOSE)
     near = np.isfinite(far)
-    agree = np.einsum("fd,fd->f", normals[near], skin.normals[nearest[near]]) > 0
+    agree = np.einsum("fd,fd->f", normals[near], skin_normals[nearest[near]]) > 0
     return 2 * near.sum() > len(seen) and float(agree.mean()) >= AGREE
 
 
@@ -124,7 +122,7 @@ def _orient(view: _Points, count: int, skin: _Skin | None) -> tuple[np.ndarray, 
     elif view.viewpoint is not None:
         outward = view.viewpoint - dense[chosen]
     elif skin is not None:
-        outward = skin.normals[skin.tree.query(dense[chosen], 4)[1]].sum(axis=1)
+        outward = skin[1][skin[0].query(dense[chosen], 4)[1]].sum(axis=1)
     else:
         outward = prepare_scan(dense).normals[chosen]
     normals *= np.where(np.einsum("nd,nd->n", normals, outward) < 0, -1, 1)[:, None]
