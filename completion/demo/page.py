@@ -34,7 +34,7 @@ def write_page(demo: Demo, metrics: list[Metric], judgement: Judgement,
                 "Every stage of the chain on the built-in people, whose true shape, pose and correspondence are known.")
     page.verdict(judgement, "Next, your own scans: `scape prep run scans --template template.ply -o set`")
     page.figures(metrics, ("measured against the truth", "value", "unit"))
-    for i, (title, text, panes) in enumerate((*_scanned(demo), *_learned(demo), *_unseen(demo))):
+    for i, (title, text, panes) in enumerate((*_show_scans(demo), *_show_model(demo), *_show_unseen(demo))):
         page.section(title, text).bodies(panes, height=HEIGHT if len(panes) < 4 else 340)
         report_progress(i + 1, 8)
     write_glb(to / "animation" / "walk.glb", demo.motion, demo.subject)
@@ -48,7 +48,7 @@ def _pane(demo: Demo, shape: Mesh | Solid, fits: np.ndarray, label: str) -> Pane
     return Pane([thin_solid(solid, 15_000)], look_around(demo.template, fits, (25,))[0], label)
 
 
-def _scanned(demo: Demo) -> Iterator[tuple[str, str, list[Pane]]]:
+def _show_scans(demo: Demo) -> Iterator[tuple[str, str, list[Pane]]]:
     """Yield title, text and panes of the scans, the template with its error, and the worst registration."""
     chosen = demo.scans[:2] + [one for one in demo.scans if one.subject != "subject"][:2]
     meshes = {one.name: read_mesh(one.path) for one in chosen}
@@ -70,7 +70,7 @@ def _scanned(demo: Demo) -> Iterator[tuple[str, str, list[Pane]]]:
             _pane(demo, off, body.vertices, f"{means[worst]:.2f} mm from the truth")])
 
 
-def _learned(demo: Demo) -> Iterator[tuple[str, str, list[Pane]]]:
+def _show_model(demo: Demo) -> Iterator[tuple[str, str, list[Pane]]]:
     """Yield title, text and panes of the parts with their joints, and of the shape components."""
     yield ("Skeleton", "The parts that move rigidly, found from the registered poses of the subject without being told "
            "how many, and the joints between them.", parts_panes(demo.template, demo.model.skeleton))
@@ -78,7 +78,7 @@ def _learned(demo: Demo) -> Iterator[tuple[str, str, list[Pane]]]:
            "standard deviations to either side.", component_panes(demo.model))
 
 
-def _unseen(demo: Demo) -> Iterator[tuple[str, str, list[Pane]]]:
+def _show_unseen(demo: Demo) -> Iterator[tuple[str, str, list[Pane]]]:
     """Yield title, text and panes of a held-out pose, the completed half view, and the walk."""
     wanted = demo.true_places(demo.held_out[0])
     fitted = demo.fit_pose(wanted)
