@@ -1,4 +1,4 @@
-"""Report page of a labelled recording: doubtful labels first, then every marker over time."""
+"""Report page of a labelled recording: its doubtful labels."""
 from __future__ import annotations
 
 from collections.abc import Sequence
