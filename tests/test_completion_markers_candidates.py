@@ -107,14 +107,6 @@ def test_a_lonely_marker_gets_its_partner(person, mirror, base):
         assert np.linalg.norm(place[label] - person.vertices[base.vertices[base.labels.index(label)]]) < 0.02
 
 
-def test_a_base_on_triangles_keeps_its_weights(person, mirror, base):
-    between = MarkerLayout(base.labels, person.faces[[np.flatnonzero((person.faces == v).any(axis=1))[0]
-                                                      for v in base.vertices]], 0.01, np.full((47, 3), 1 / 3))
-    more = candidate_layout(person, between, 60, mirror=mirror)
-    np.testing.assert_array_equal(more.weights[:47], between.weights)
-    np.testing.assert_array_equal(more.weights[47:], np.tile([1.0, 0, 0], (13, 1)))
-
-
 def test_what_cannot_be_done_is_refused(person, mirror, base):
     with pytest.raises(ValueError, match="count: expected at least the 47 markers of the base"):
         candidate_layout(person, base, 46, mirror=mirror)

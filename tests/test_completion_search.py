@@ -9,7 +9,7 @@ from completion.partial.settings import CompletionConfig
 from model.fitting.bodies import FixedBody
 from model.fitting.scan import prepare_scan
 from model.fitting.scan_fit import scan_fit
-from model.fitting.starts import AXES, all_rotations, from_nothing, pick_varied, placements, starting_poses
+from model.fitting.starts import AXES, all_rotations, from_nothing, placements, starting_poses
 from scanprep.geometry import rotations
 from scanprep.geometry.surface import Surface
 
@@ -43,13 +43,6 @@ def test_turns_are_rotations_that_leave_no_gap():
     cosine = (np.einsum("aij,bij->ab", any_turn, turns).max(axis=1) - 1) / 2
     assert np.degrees(np.arccos(cosine.min())) < 35                       # of any turn, one is near
     assert np.degrees(np.arccos(cosine.mean())) < 20
-
-
-def test_varied_poses_are_the_corners():
-    poses = np.zeros((9, 2, 3))
-    poses[:, 1, 0] = [0, 0.1, 0.2, -0.1, 1, 0.9, -1, -0.95, 0.05]
-    np.testing.assert_array_equal(pick_varied(poses, 3)[:, 1, 0], [0, 1, -1])
-    assert pick_varied(poses, 9) is poses
 
 
 def test_neighbouring_twists_are_damped_and_the_root_is_not(model, scene):
