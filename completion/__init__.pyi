@@ -12,7 +12,6 @@ from .mocap.joint_angles import angle_table as angle_table
 from .mocap.labelling.label import label_markers as label_markers
 from .mocap.labelling.label import label_people as label_people
 from .mocap.labelling.stream import LabelStream as LabelStream
-from .mocap.labelling.unknown_layout import find_layout as find_layout
 from .mocap.marker_selection.design import design_markers as design_markers
 from .mocap.marker_sets.layout import MarkerLayout as MarkerLayout
 from .mocap.marker_sets.named import layout_names as layout_names

@@ -1,17 +1,31 @@
 """The command `scape completion`: the script with which a shell completes commands and flags."""
 from __future__ import annotations
 
-import argparse
 import sys
 from collections.abc import Mapping
-from pathlib import Path
 from typing import Annotated, Literal
 
-from scanprep.arguments import Argument, Place
+from scanprep.arguments import Place
 from scanprep.command_line import Arguments, load_command
 from scanprep.console import Outcome
 
-ShellArg = Annotated[Literal["bash", "zsh", "tcsh"], Place("SHELL")]
+ShellArg = Annotated[Literal["bash", "zsh"], Place("SHELL")]
+# zsh runs it by its own emulation of bash; where nothing is offered, both complete names of files
+SCRIPT = """_scape() {{
+    local at=scape cur="${{COMP_WORDS[COMP_CWORD]}}" words="" word
+    for word in "${{COMP_WORDS[@]:1:$((COMP_CWORD - 1))}}"; do
+        case "$at $word" in {paths}) at="$at $word";; esac
+    done
+    case "$at ${{COMP_WORDS[$((COMP_CWORD - 1))]}}" in
+{values}
+    *) case "$at $cur" in
+{words}
+    esac;;
+    esac
+    COMPREPLY=($(compgen -W "$words" -- "$cur"))
+}}
+complete -o default -F _scape scape
+"""
 
 
 def write_shell(shell: ShellArg) -> Outcome:
@@ -20,35 +34,31 @@ def write_shell(shell: ShellArg) -> Outcome:
     Example: scape completion bash > ~/.local/share/bash-completion/completions/scape
 
     Args:
-        shell: bash, zsh or tcsh. For zsh the file is _scape in a folder of $fpath.
+        shell: bash, or zsh, in whose .zshrc the line eval "$(scape completion zsh)" stands after compinit.
     """
-    import shtab
-
     from .__main__ import COMMANDS
 
-    parser = argparse.ArgumentParser(prog="scape")
-    _add(parser, COMMANDS, "scape")
-    sys.stdout.write(shtab.complete(parser, shell) + "\n")
+    paths, values, words = list[str](), list[str](), list[str]()
+    _collect("scape", COMMANDS, paths, values, words)
+    script = SCRIPT.format(paths="|".join(paths), values="\n".join(values), words="\n".join(words))
+    sys.stdout.write(("autoload -U +X bashcompinit && bashcompinit\n" if shell == "zsh" else "") + script)
     return Outcome(None, [], judgement=None)
 
 
-def _add(parser: argparse.ArgumentParser, commands: Mapping[str, tuple[str, str]], prog: str) -> None:
-    """Add the commands of a group, and everything below, as subparsers."""
-    below = parser.add_subparsers()
-    for name, (text, target) in commands.items():
+def _collect(prog: str, commands: Mapping[str, tuple[str, str]], paths: list[str], values: list[str],
+             words: list[str]) -> None:
+    """Add the lines of the script for the commands of a group, and for everything below."""
+    words.append(f'    "{prog} $cur") words="{" ".join(commands)}";;')
+    for name, (_, target) in commands.items():
         function, path = load_command(target), f"{prog} {name}"
+        paths.append(f'"{path}"')
         if function.__name__ == "group":
-            _add(below.add_parser(name, help=text, prog=path), sys.modules[function.__module__].COMMANDS, path)
-        else:
-            made = Arguments(function, path, []).parser(_offer)
-            below.add_parser(name, help=text, prog=path, parents=[made], add_help=False)
-
-
-def _offer(argument: Argument, action: argparse.Action) -> None:
-    """Set what the shell offers as value of an argument: its choices, or files."""
-    import shtab
-
-    if argument.choices:
-        action.choices = argument.choices
-    elif Path in (argument.type, *argument.parts):
-        action.complete = shtab.FILE            # type: ignore[attr-defined]
+            _collect(path, sys.modules[function.__module__].COMMANDS, paths, values, words)
+            continue
+        listed = Arguments(function, path, []).listed
+        flags = [flag for argument in listed for flag in argument.flags]
+        words.append(f'    "{path} -"*) words="{" ".join([*flags, "--help"])}";;')
+        for argument in listed:
+            if argument.choices:
+                patterns = "|".join(f'"{path} {flag}"' for flag in argument.flags) or f'"{path} {name}"'
+                values.append(f'    {patterns}) words="{" ".join(map(str, argument.choices))}";;')

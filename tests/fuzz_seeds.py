@@ -337,8 +337,7 @@ def _add_tables(body: Mesh, place: Any, add: Any, text: Any) -> None:
     marked = np.arange(len(body.vertices)) % 3 == 0
     np.save(path := place("mask.npy"), marked)
     add(path, lambda path: read_mask(path, body.vertices))
-    for name, content in (("mask.json", json.dumps(marked.tolist())), ("numbers.json", "[0, 3, 9]"),
-                          ("mask.txt", "0 3 9 # ears\n12,15\n")):
+    for name, content in (("mask.json", json.dumps(marked.tolist())), ("numbers.json", "[0, 3, 9]")):
         text(name, content, lambda path: read_mask(path, body.vertices))
     write_points(path := place("painted.ply"), PointCloud(body.vertices, None, np.where(marked[:, None], [1, 0, 0], 1)))
     add(path, lambda path: read_mask(path, body.vertices))

@@ -2,7 +2,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from completion_bodies import half_view, worm_with_prior
+from completion_bodies import MARKS, POSE, TRANS, half_view, worm_with_prior
 from derivatives import slope
 
 from completion.partial.alternation import Alternation, Blocks, Markers, nearest_markers, solve_twists
@@ -15,10 +15,7 @@ from model.gradients import edges
 from scanprep.geometry import rotations
 from scanprep.geometry.surface import Surface
 
-POSE = np.array([[0.3, -0.5, 0.8], [0.2, 0.5, -0.4], [-0.1, -0.6, 0.3], [0.3, 0.1, 0.5]])
-TRANS = np.array([0.4, -0.3, 1.1])
 BETAS = np.array([1.2, -0.8, 0.5])
-MARKS = np.array([6, 75, 130, 200, 255, 330, 396])
 TURNS = CompletionConfig(random_starts=12, rounds=6, scan_points=800, model_points=300,
                          method="alternation")
 MODEL = worm_with_prior()

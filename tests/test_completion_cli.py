@@ -12,7 +12,6 @@ from scene_reader import scenes_of
 from completion.__main__ import main
 from completion.partial import report
 from completion.partial.completion import load_completion
-from completion.partial.work import read_view
 from scanprep.geometry.files import PointCloud, read_mesh, write_mesh, write_points
 from scanprep.geometry.landmarks import write_landmarks
 from scanprep.geometry.mesh import Mesh
@@ -209,20 +208,3 @@ def test_what_cannot_be_used_is_named(place, tmp_path, capsys, monkeypatch, word
     settings = () if "--config" in words else quick(place)
     assert run(*words, "-m", "model.npz", "-o", tmp_path / "out", *settings) == 1
     assert message in " ".join(capsys.readouterr().err.split())
-
-
-def test_wrong_usage_is_2_and_help_shows_an_example(capsys):
-    assert run("scan.ply") == 2                                      # no output
-    with pytest.raises(SystemExit) as stop:
-        run("--help")
-    assert stop.value.code == 0 and "Example: scape complete half.ply" in capsys.readouterr().out
-
-
-def test_clouds_keep_normals_and_colours(tmp_path):
-    points = np.random.default_rng(0).normal(size=(20, 3))
-    up = np.tile([0, 0, 1.0], (20, 1))
-    for name in ("a.ply", "a.pcd"):
-        write_points(tmp_path / name, PointCloud(points, up, 0 * up))
-        view = read_view(tmp_path / name)
-        np.testing.assert_allclose(view.normals, up)
-        np.testing.assert_array_equal(view.colors, 0)

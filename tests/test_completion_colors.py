@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from glb_reader import Glb
 
-from completion.partial.colors import ColorConfig, blend, carry_colors, views_with_colors
+from completion.partial.colors import blend, carry_colors, views_with_colors
 from scanprep.geometry.files import PointCloud
 from scanprep.geometry.format_glb import Glb as GlbFile
 from scanprep.geometry.format_glb import one_mesh, tallest, turn_up
@@ -69,18 +69,18 @@ def test_the_view_that_looked_squarely_counts_most():
     square, slanted = (PointCloud(points, up, np.tile(c, (len(x), 1))) for c in ([1.0, 0, 0], [0, 0, 1.0]))
     cameras = np.array([[0, 0, 2.0], [2 * np.sin(1.2), 0, 2 * np.cos(1.2)]])
     found = views_with_colors([square, slanted], cameras)
-    colors, weight = blend(found, np.zeros((1, 3)), up[:1], ColorConfig())
+    colors, weight = blend(found, np.zeros((1, 3)), up[:1])
     share = np.cos(1.2)**2 / (1 + np.cos(1.2)**2)
     np.testing.assert_allclose(colors[0], [1 - share, 0, share], atol=1e-9)
     assert weight[0] == pytest.approx(1 + np.cos(1.2)**2)
-    away = blend(found, np.array([[0, 0, 0.05], [0, 0, 0]]), np.array([[0, 0, 1.0], [0, 0, -1]]), ColorConfig())
+    away = blend(found, np.array([[0, 0, 0.05], [0, 0, 0]]), np.array([[0, 0, 1.0], [0, 0, -1]]))
     np.testing.assert_array_equal(away[1], 0)                        # too far, and the other side
 
 
 def test_what_was_not_seen_is_grey_or_filled(person, views):
     meshes, cameras, seen = views
-    grey = carry_colors(person, seen, meshes[:1], ColorConfig(), cameras[0])
-    filled = carry_colors(person, seen, meshes[:1], ColorConfig(fill=True), cameras[0])
+    grey = carry_colors(person, seen, meshes[:1], viewpoint=cameras[0])
+    filled = carry_colors(person, seen, meshes[:1], fill=True, viewpoint=cameras[0])
     unseen = (grey == 0.6).all(axis=1)
     assert unseen.mean() > 0.3 and (np.ptp(filled[unseen], axis=0) > 0.1).all()
     np.testing.assert_array_equal(filled[~unseen], grey[~unseen])
@@ -89,8 +89,6 @@ def test_what_was_not_seen_is_grey_or_filled(person, views):
 def test_a_scan_without_colours_is_refused(person, views):
     with pytest.raises(ValueError, match="expected colours at its points, found none"):
         carry_colors(person, views[2], [Mesh(views[0][0].vertices, views[0][0].faces), np.zeros((40, 3))])
-    with pytest.raises(ValueError, match="reach: expected above 0"):
-        ColorConfig(reach=0)
 
 
 # ---- textures

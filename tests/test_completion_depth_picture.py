@@ -11,7 +11,6 @@ from completion.__main__ import main
 from completion.partial import report
 from completion.partial.completion import complete, completion_doubts, find_stray, load_completion
 from completion.partial.inputs import prepare_in_metres
-from completion.partial.work import read_picture
 from model.fitting.bodies import as_body
 from model.fitting.scan_fit import scan_fit
 from scanprep.depth_camera.picture import DepthPicture
@@ -105,9 +104,3 @@ def test_a_picture_goes_in_as_a_file_and_a_refusal_says_why(model, body, marks, 
     assert (tmp_path / "out" / "report.html").exists()
     assert main(["complete", str(tmp_path / "wall.png"), *words[:3], str(tmp_path / "none"), *words[4:]]) == 1
     assert "nobody is in it" in capsys.readouterr().err
-
-
-def test_a_picture_comes_alone(tmp_path):
-    assert read_picture([tmp_path / "one.ply"]) is None
-    with pytest.raises(ValueError, match="one depth picture alone"):
-        read_picture([tmp_path / "one.png", tmp_path / "two.png"])

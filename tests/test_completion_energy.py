@@ -4,7 +4,7 @@ from completion_bodies import worm_with_prior
 from derivatives import differences
 
 from model.fitting import energy
-from model.fitting.bodies import FixedBody, ShapedBody, anchor_at, as_body
+from model.fitting.bodies import FixedBody, ShapedBody, anchor_at
 from model.priors import JointLimits, gaussian_prior
 from scanprep.geometry import rotations
 
@@ -137,8 +137,3 @@ def test_derivatives_by_betas_are_carried_with_the_bones():
     off = np.linalg.norm(anchor.carry(ids, bent) - exact) / np.linalg.norm(exact)
     still = np.linalg.norm(anchor.carry(ids, pose) - exact) / np.linalg.norm(exact)
     assert off < 0.05 and off < 0.6 * still
-
-
-def test_a_body_must_be_a_model_or_a_subject():
-    with pytest.raises(ValueError, match="body: expected a BodyModel or a Subject, got Mesh"):
-        as_body(MODEL.template)

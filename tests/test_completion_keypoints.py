@@ -97,11 +97,6 @@ def test_names_of_joints_alone_need_hips_as_near_as_centres():
     assert find_keypoints([*centres.labels, "C7", "SACR", "LTHI", "RTHI"], (), 0.5) == ()
 
 
-def test_hips_that_were_never_seen_tell_nothing():
-    labels = tuple(both("{}{}", LIMBS))
-    assert measure_hips([MarkerSequence(np.full((3, 12, 3), np.nan), labels, 50.0)]) is None
-
-
 def coverage_of(labels):
     """Of a recording under these labels, of which helenhayes29 knows some."""
     layout = load_layout("helenhayes29", MODEL.template, KEPT).with_spellings(labels)

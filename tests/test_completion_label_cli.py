@@ -1,29 +1,17 @@
-"""`scape label`, `--unlabelled` of `animate` and `mosh`, and `scape layout find`, as users call them."""
+"""`scape label` on people of the built-in model, as users call it."""
 import json
 import warnings
 
 import numpy as np
 import pytest
-from c3d_bytes import c3d_bytes
 from labelling import RATE, person, shuffled, unnamed
 
 from completion.__main__ import main
-from completion.mocap.files.c3d import point_table
-from completion.mocap.files.c3d_points import rename_points
 from completion.mocap.files.markers import MarkerSequence, read_markers, write_markers
-from completion.mocap.labelling import unknown_layout
-from completion.mocap.labelling.corrections import read_corrections
-from completion.mocap.labelling.label import GHOST
-from completion.mocap.labelling.recording import pack_tracks
-from completion.mocap.labelling.tracks import link_points
-from completion.mocap.labelling.unknown_layout import name_markers, suggest_names
-from completion.mocap.marker_sets.layout import MarkerLayout
 from completion.mocap.marker_sets.named import choose_layout
 from completion.mocap.marker_sets.opensim import opensim_markers
-from completion.mocap.subject.person import PersonConfig
 from model import load_model
 from scanprep.geometry.landmark_writing import marker_set
-from scanprep.geometry.tables import read_table
 
 
 @pytest.fixture(scope="module")
@@ -70,41 +58,6 @@ def test_the_recording_is_labelled_and_nothing_is_lost(out):
 
 
 @pytest.mark.slow
-def test_corrections_come_back(out):
-    """The two front markers of the head exchanged by hand, and one made none."""
-    rows = [row for _, row in read_table(out / "labelled.labels.csv", ("track", "label"))]
-    names = {"LFHD": "RFHD", "RFHD": "LFHD", "CLAV": ""}
-    lines = ["track,point,begin,end,label,confidence,fixed"]
-    for row in rows:
-        fixed = "yes" if row["label"] in names else ""
-        label = names.get(row["label"], row["label"])
-        lines.append(",".join([row["track"], row["point"], row["begin"], row["end"], label, row["confidence"], fixed]))
-    (out / "mine.csv").write_text("\n".join(lines))
-    assert run(out, "label", "raw.c3d", "--layout", "cmu41", "--labels", "mine.csv", "-o", "again.c3d") == 0
-    before, after = read_markers(out / "labelled.c3d"), read_markers(out / "again.c3d")
-    for one, other in (("LFHD", "RFHD"), ("RFHD", "LFHD")):
-        a, b = before.select([one]).positions, after.select([other]).positions
-        assert np.isclose(a, b, equal_nan=True).all()
-    assert not after.select(["CLAV"]).seen.any()
-    known = read_corrections(out / "mine.csv", link_points(read_markers(out / "raw.c3d").positions, RATE),
-                             after.labels[:41])
-    assert (known == GHOST).sum() == before.select(["CLAV"]).seen.sum()
-
-
-@pytest.mark.parametrize(("line", "words"), [
-    ("0,*1,0,3,NOSE,0.9,yes", "line 2: expected a label of the layout or nothing, found 'NOSE'"),
-    ("0,*1,0,x,LFHD,0.9,yes", "line 2: expected whole numbers for track, begin and end"),
-    ("9999,*1,0,3,LFHD,0.9,yes", "line 2: expected frames of track 9999 in 0 to 3"),
-    ("0,*1,0,3,LFHD,0.9,perhaps", "line 2: expected yes or nothing in the column fixed, found 'perhaps'"),
-])
-def test_corrections_that_cannot_be_are_told(out, capsys, line, words):
-    (out / "bad.csv").write_text("track,point,begin,end,label,confidence,fixed\n" + line + "\n")
-    assert run(out, "label", "raw.c3d", "--layout", "cmu41", "--labels", "bad.csv", "-o", "no.c3d") == 1
-    told = capsys.readouterr().err
-    assert "bad.csv" in told and words in " ".join(told.split()) and not (out / "no.c3d").exists()
-
-
-@pytest.mark.slow
 def test_a_known_person_and_other_formats(place, capsys):
     assert run(place, "label", "raw.trc", "--layout", "cmu41", "--subject", "betas.json", "-o", "known.csv") == 0
     true, found = read_markers(place / "true.c3d"), read_markers(place / "known.csv")
@@ -112,82 +65,15 @@ def test_a_known_person_and_other_formats(place, capsys):
     assert same.mean() > 0.98
 
 
-@pytest.mark.slow
-def test_labels_that_are_there_are_believed_unless_told_otherwise(place):
-    true = read_markers(place / "true.c3d")
-    swapped = [{"LFHD": "RFHD", "RFHD": "LFHD"}.get(label, label) for label in true.labels]
-    write_markers(place / "swapped.c3d", MarkerSequence(true.positions, tuple(swapped), true.rate))
-    for words, right in (((), False), (("--relabel",), True)):
-        assert run(place, "label", "swapped.c3d", "--layout", "cmu41", "--subject", "betas.json", *words, "-o",
-                   "told.c3d") == 0
-        found = read_markers(place / "told.c3d").select(["LFHD"]).positions
-        assert np.isclose(found, true.select(["LFHD"]).positions, atol=1e-5, equal_nan=True).all() == right
-
-
 @pytest.mark.parametrize(("words", "said"), [
-    (("label", "raw.c3d", "-o", "x.c3d"), "--layout: expected one, the recording has no labels of a marker set"),
-    (("label", "raw.c3d", "--layout", "cmu41", "-o", "x.txt"), "a file ending in .c3d, .trc, .csv, or a folder"),
-    (("label", "raw.c3d", "--layout", "cmu41", "--people", "0", "-o", "x.c3d"), "--people: expected one at least"),
     (("label", "few.c3d", "--layout", "cmu41", "-o", "x.c3d"), "at least 10 points, the best has 9"),
     (("label", "raw.c3d", "--layout", "cmu41", "--unit", "m", "-o", "x.c3d"), "metres taken for millimetres"),
-    (("animate", "raw.c3d", "--unlabelled", "-o", "x"), "--unlabelled: expected --layout"),
-    (("mosh", "raw.c3d", "--unlabelled", "-o", "x"), "--unlabelled: expected --layout"),
-    (("layout", "find", "few.c3d", "-o", "x.json"), "at least 10 tracks that are seen in 30% of the frames"),
 ])
 def test_what_cannot_be_labelled_is_told(place, capsys, words, said):
     raw = read_markers(place / "raw.c3d")
     write_markers(place / "few.c3d", MarkerSequence(raw.positions[:, :9], raw.labels[:9], raw.rate))
     assert run(place, *words) in (1, 2)
     assert said in " ".join(capsys.readouterr().err.split()) and not (place / "x.c3d").exists()
-
-
-@pytest.mark.slow
-def test_animate_labels_first(place):
-    assert run(place, "animate", "raw.c3d", "--unlabelled", "--layout", "cmu41", "--subject", "betas.json", "-o",
-               "moving") == 0
-    true, found = read_markers(place / "true.c3d"), read_markers(place / "moving" / "labelled.c3d")
-    same = np.isclose(found.select(true.labels).positions, true.positions, atol=1e-5, equal_nan=True).all(axis=2)
-    assert same.mean() > 0.98 and (place / "moving" / "labels.csv").exists()
-    first = (place / "moving" / "labels.csv").stat().st_mtime_ns
-    assert run(place, "animate", "raw.c3d", "--unlabelled", "--layout", "cmu41", "--subject", "betas.json", "-o",
-               "moving") == 0
-    assert (place / "moving" / "labels.csv").stat().st_mtime_ns == first                    # not labelled anew
-    motion = np.load(place / "moving" / "motion.npz")
-    assert np.isfinite(motion["poses"]).all()
-
-
-@pytest.mark.parametrize("scale", [-1.0, 0.1])
-def test_a_c3d_keeps_what_is_not_points(tmp_path, scale):
-    """Analog channels and further parameters; points go bit for bit under their new labels."""
-    rng = np.random.default_rng(0)
-    places, analog = rng.uniform(-1, 1, (6, 4, 3)).round(4), rng.integers(-99, 99, (12, 3)).astype(float)
-    path = tmp_path / "raw.c3d"
-    path.write_bytes(c3d_bytes(places * 1000, ["*1", "*2", "*3", "*4"], scale=scale, analog=analog,
-                               more=[("SUBJECT", "NAME", ["Eve"])]))
-    order = np.stack([rng.permutation(4) for _ in range(6)])
-    order[2, 1] = -1
-    data = path.read_bytes()
-    written = tmp_path / "named.c3d"
-    written.write_bytes(rename_points(path, data, ["A", "B", "C", "D"], order))
-    before, after = read_markers(path).positions, read_markers(written)
-    wanted = np.take_along_axis(before, np.maximum(order, 0)[..., None], axis=1)
-    wanted[order < 0] = np.nan
-    assert after.labels == ("A", "B", "C", "D") and np.array_equal(after.positions, wanted, equal_nan=True)
-    tables = [point_table(p, p.read_bytes()) for p in (path, written)]
-    rows = [np.frombuffer(p.read_bytes(), np.uint8, t.frames * t.width, t.start).reshape(t.frames, -1)
-            for p, t in zip((path, written), tables, strict=True)]
-    own = 16 * (4 if scale < 0 else 2)
-    assert np.array_equal(rows[0][:, own:], rows[1][:, own:]) and rows[0].shape[1] > own
-    assert b"Eve" in written.read_bytes()
-    with pytest.raises(ValueError, match="expected a file of 3 frames"):
-        rename_points(path, data, ["A", "B", "C", "D"], order[:3])
-
-
-def test_tracks_are_packed_into_few_series():
-    tracks = np.array([[0, 1], [0, 1], [-1, 1], [2, -1]])
-    packed = pack_tracks(tracks, tracks >= 0)
-    assert packed.shape == (4, 2) and (packed >= 0).sum() == (tracks >= 0).sum()
-    assert pack_tracks(tracks, np.zeros((4, 2), dtype=bool)).shape == (4, 0)
 
 
 def test_a_marker_set_of_opensim_is_a_layout(tmp_path):
@@ -206,35 +92,3 @@ def test_a_marker_set_of_opensim_is_a_layout(tmp_path):
         (tmp_path / "bad.xml").write_text(text)
         with pytest.raises(ValueError, match=words):
             choose_layout(model, str(tmp_path / "bad.xml"), ())
-
-
-@pytest.mark.slow
-def test_a_layout_is_found_by_the_command(place, monkeypatch):
-    """With little effort, of a person who stands still: which is what the verdict says."""
-    for name, value in (("STARTS", 1), ("TRIED", 1), ("ROUNDS", 1), ("NAMED", 1),
-                        ("CLOSER", PersonConfig(frames=4, n_betas=5, pose=0.02))):
-        monkeypatch.setattr(unknown_layout, name, value)
-    true = read_markers(place / "true.c3d")
-    names = tuple(f"u{i}" for i in range(len(true.labels)))
-    still = np.repeat(true.positions[:1], 12, axis=0)
-    write_markers(place / "tracks.c3d", MarkerSequence(still, names, true.rate))
-    assert run(place, "layout", "find", "tracks.c3d", "-o", "found.json") == 0
-    found = MarkerLayout.load(place / "found.json")
-    assert len(found.labels) > 0.7 * len(true.labels)
-    told = json.loads((place / "found.json.report.json").read_text())["judgement"]
-    assert told["verdict"] == "check" and "the person hardly moves" in " ".join(told["reasons"])
-    assert (place / "found.png").exists() and "uncertain by" in (place / "found.report.html").read_text()
-
-
-def test_markers_of_a_usual_set_get_its_names():
-    """On the model's own body, each up to three centimetres beside its place; markers anywhere get those of parts."""
-    model = load_model("people")
-    usual, _ = choose_layout(model, "vicon47", ())
-    vertices, rng = model.template.vertices, np.random.default_rng(0)
-    near = [rng.choice(np.flatnonzero(np.linalg.norm(vertices - place, axis=1) < 0.03))
-            for place in usual.skin_points(vertices)]
-    worn = MarkerLayout(tuple(f"u{i}" for i in range(47)), np.array(near))
-    found, names = name_markers(model, worn)
-    assert found is not None and np.mean([names.get(f"u{i}") == label for i, label in enumerate(usual.labels)]) > 0.9
-    few = worn.select(worn.labels[:1])
-    assert suggest_names(model, few, {})[0].rstrip("0123456789") in model.skeleton.names

@@ -24,9 +24,9 @@ from completion.mocap.files.c3d import point_table
 from completion.mocap.files.c3d_points import rename_points
 from completion.mocap.files.markers import MarkerFileError, read_marker_points
 from completion.mocap.labelling import recording
-from completion.mocap.labelling.corrections import COLUMNS, read_corrections, write_labels
+from completion.mocap.labelling.corrections import COLUMNS, read_corrections
 from completion.mocap.labelling.label import GHOST, UNKNOWN
-from completion.mocap.labelling.recording import columns_of_labels, pack_tracks
+from completion.mocap.labelling.recording import columns_of_labels
 from completion.mocap.labelling.tracks import link_points
 from completion.mocap.mosh import cli as mosh_cli
 from completion.mocap.mosh.call import MoshCall
@@ -167,25 +167,6 @@ def test_whole_numbers_and_other_counts(here):
             rename_points(folder / "whole.c3d", data, ["E", "D", "none", "A"], wrong)
 
 
-@pytest.mark.parametrize("seed", range(4))
-def test_loose_tracks_take_as_few_columns_as_can_be(seed):
-    rng = np.random.default_rng(seed)
-    tracks = np.full((60, 12), -1)
-    for number, (column, begin) in enumerate((c, b) for c in range(12) for b in (0, 30)):
-        length = rng.integers(1, 30)
-        tracks[begin:begin + length, column] = number
-    wanted = (tracks >= 0) & (rng.random(24)[tracks] < 0.7)
-    packed = pack_tracks(tracks, wanted)
-    frames, columns = np.nonzero(packed >= 0)
-    assert sorted(zip(frames.tolist(), packed[frames, columns].tolist(), strict=True)) == sorted(
-        map(tuple, np.argwhere(wanted).tolist()))
-    assert packed.shape[1] == wanted.sum(axis=1).max()               # no track has a hole here
-    for column in packed.T:
-        numbers = tracks[np.arange(60), column][column >= 0]
-        assert (np.diff(np.flatnonzero(np.r_[True, np.diff(numbers) != 0])) > 0).all()
-        assert len(np.unique(numbers)) == 1 + (np.diff(numbers) != 0).sum()          # each in one piece
-
-
 def test_the_table_says_what_was_found_and_gives_it_back(here):
     folder, _ = here
     assert label("raw.c3d", "-o", "out.c3d") == 0
@@ -251,17 +232,6 @@ def test_a_wrong_table_is_refused(here, capsys, case):
     assert "wrong.csv" in said
     assert re.search(message, said), said
     assert not (folder / "other.c3d").exists()
-
-
-def test_rows_that_are_not_fixed_say_nothing(tmp_path):
-    tracks = np.array([[0, 1], [0, 1], [0, -1]])
-    write_labels(tmp_path / "t.csv", ["=a", "b"], tracks, np.array([[0, 1], [0, 1], [1, -1]]), ["A", "B"],
-                 np.array([[0.9, 0.5], [0.9, 0.5], [0.2, 0]]), np.array([[1, 0], [1, 0], [0, 0]], dtype=bool))
-    rows = rows_of(tmp_path / "t.csv")
-    assert [(r["track"], r["begin"], r["end"], r["label"], r["confidence"], r["fixed"]) for r in rows] == [
-        ("0", "2", "2", "B", "0.2", ""), ("1", "0", "1", "B", "0.5", ""), ("0", "0", "1", "A", "0.9", "yes")]
-    np.testing.assert_array_equal(read_corrections(tmp_path / "t.csv", tracks, ["A", "B"]),
-                                  [[0, UNKNOWN], [0, UNKNOWN], [UNKNOWN, UNKNOWN]])
 
 
 def test_labels_that_the_recording_has_are_believed_unless_asked(here):

@@ -160,17 +160,6 @@ def test_a_body_that_was_found_wrongly_is_noticed_and_sought_anew(subject, layou
     assert share_right(frames[100:], points[100:], names[100:]) > 0.995
 
 
-def test_nothing_is_found_where_there_is_nobody_and_it_is_not_sought_in_every_frame(subject, layout):
-    stream = LabelStream(subject, layout, RATE)
-    find, calls = stream.search.find, []
-    stream.search.find = lambda points: calls.append(1) or find(points)
-    room = np.random.default_rng(5).random((30, 30, 3)) * 4
-    frames = pushed(stream, room)
-    assert not any(frame.found for frame in frames) and np.isnan(frames[-1].pose).all()
-    assert len(calls) == 1
-    assert not stream.push(np.zeros((3, 3))).found                                                # too few to seek
-
-
 def test_wrong_arguments_are_told(subject, layout):
     for rate in (0.0, -1.0, np.nan, np.inf):
         with pytest.raises(ValueError, match="rate"):

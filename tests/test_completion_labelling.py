@@ -7,7 +7,6 @@ from completion.mocap.labelling.assignment import find_displaced, mean_offsets
 from completion.mocap.labelling.label import GHOST, UNKNOWN, label_markers, label_people
 from completion.mocap.labelling.layout_order import order_by_layout
 from completion.mocap.labelling.separate import separate_people
-from completion.mocap.labelling.stream import LabelStream
 from completion.mocap.labelling.tracks import has_tracks, link_points
 from completion.mocap.marker_sets.layout import MarkerLayout
 
@@ -36,19 +35,14 @@ def test_points_that_are_shuffled_in_every_frame_get_their_labels(labelled):
     assert found.markers.positions.shape == (*found.columns.shape, 3)
     assert (found.confidence[found.columns >= 0] > 0.9).mean() > 0.97
     assert (found.confidence[found.columns < 0] == 0).all()
+    for row in found.columns:                                        # no point has two labels
+        assert len(np.unique(row[row >= 0])) == (row >= 0).sum()
 
 
 def test_ghosts_stay_without_a_label(labelled):
     found, points, truth = labelled
     assert found.unlabelled[truth == -1].mean() > 0.95
     assert not found.unlabelled[~np.isfinite(points[..., 0])].any()
-
-
-def test_no_point_has_two_labels(labelled):
-    found, _, _ = labelled
-    for row in found.columns:
-        taken = row[row >= 0]
-        assert len(np.unique(taken)) == len(taken)
 
 
 @pytest.mark.slow
@@ -106,30 +100,6 @@ def test_what_is_no_person_is_refused(one):
         label_markers(subject, unnamed(places[:4] * 1000), layout)
     with pytest.raises(ValueError, match=r"known: expected \(60, 41\)"):
         label_markers(subject, unnamed(places), layout, np.zeros((3, 41), dtype=int))
-
-
-def test_a_stream_labels_as_well_and_finds_people_who_come_back(one):
-    subject, layout, places = one
-    gone = np.full((40, *places.shape[1:]), np.nan)
-    points, truth = shuffled(np.concatenate([places[:30], gone, places[40:60] + [0.0, 0.0, 0.5]]))
-    truth[~np.isfinite(points[..., 0])] = -2
-    stream = LabelStream(subject, layout, RATE)
-    frames = [stream.push(each) for each in points]
-    columns = np.stack([frame.columns for frame in frames])
-    assert share_right(columns[:30], truth[:30]) == 1.0
-    assert (columns[30:70] == -1).all() and not frames[69].found and np.isnan(frames[69].pose).all()
-    assert share_right(columns[70:], truth[70:]) > 0.99
-    assert all(np.isfinite(frame.pose).all() for frame in frames if frame.found)
-
-
-def test_a_stream_refuses_what_it_cannot_follow(one):
-    subject, layout, _ = one
-    with pytest.raises(ValueError, match="rate: expected a number above 0"):
-        LabelStream(subject, layout, 0.0)
-    with pytest.raises(ValueError, match="at least 10 markers, got 3"):
-        LabelStream(subject, layout.select(layout.labels[:3]), 100.0)
-    frame = LabelStream(subject, layout, 100.0).push(np.zeros((0, 3)))
-    assert not frame.found and (frame.columns == -1).all()
 
 
 def test_tracks_are_cut_rather_than_confused():

@@ -97,17 +97,6 @@ def test_a_c3d_cut_off_anywhere_is_refused(tmp_path, part):
     refused(tmp_path / "cut.c3d")
 
 
-def test_a_c3d_without_points(tmp_path):
-    tree = ezc3d.c3d()
-    tree["parameters"]["POINT"]["RATE"]["value"] = [100.0]
-    tree["parameters"]["ANALOG"]["RATE"]["value"] = [100.0]
-    tree["parameters"]["ANALOG"]["LABELS"]["value"] = ("force",)
-    tree["data"]["points"], tree["data"]["analogs"] = np.ones((4, 0, 5)), np.ones((1, 1, 5))
-    tree["data"]["rotations"] = np.zeros((4, 4, 0, 5))
-    tree.write(str(tmp_path / "a.c3d"))
-    refused(tmp_path / "a.c3d", "expected points")
-
-
 def test_ezc3d_reads_the_same(tmp_path):
     seq = sequence(np.random.default_rng(9), 30)
     write_markers(tmp_path / "a.c3d", seq)
@@ -131,23 +120,6 @@ def test_a_damaged_c3d_is_read_or_refused_but_never_breaks(tmp_path, seed):
             read_markers(tmp_path / "bad.c3d")
         except MarkerFileError as error:
             assert "bad.c3d" in str(error) and "\n" not in str(error)
-
-
-def test_integers_times_the_scale_are_read(tmp_path):
-    steps = np.random.default_rng(10).integers(-2000, 2000, (6, 4, 3))
-    expected = MarkerSequence(steps * 5e-4, ("A", "B", "C", "D"), 100.0)
-    write_markers(tmp_path / "a.c3d", expected)
-    data = bytearray((tmp_path / "a.c3d").read_bytes())
-    start = (struct.unpack_from("<H", data, 16)[0] - 1) * 512
-    rows = np.zeros((6, 4, 4), dtype="<i2")
-    rows[..., :3] = steps
-    rows[2, 1, 3] = -1
-    data[12:16] = struct.pack("<f", 0.5)
-    data = data[:start] + rows.tobytes()
-    (tmp_path / "integers.c3d").write_bytes(bytes(data))
-    gap = expected.positions.copy()
-    gap[2, 1] = np.nan
-    agree(read_markers(tmp_path / "integers.c3d"), MarkerSequence(gap, expected.labels, 100.0))
 
 
 @pytest.mark.parametrize(("processor", "turn"), [(85, "dec"), (86, "big")])

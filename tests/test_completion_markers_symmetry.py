@@ -9,10 +9,9 @@ from completion.mocap.marker_sets.symmetry import (
     label_pairs,
     marker_pairs,
     mirror_points,
-    other_side,
-    side_of,
 )
 from scanprep.geometry.rotations import exp
+from scanprep.geometry.sides import other_side, side_of
 from scanprep.synthetic.people import SyntheticPerson
 from scanprep.synthetic.topology import load_topology
 
@@ -51,7 +50,7 @@ def test_partners_by_label():
 def test_the_mirror_image_is_found_whatever_the_triangulation(person, mirror):
     true = person.vertices[load_topology().mirror]                           # known there, and not made use of
     off = np.linalg.norm(mirror.image(person) - true, axis=1)
-    assert off.max() < 0.001 and (mirror.partner == load_topology().mirror).mean() > 0.999 and mirror.returns < 0.0005
+    assert off.max() < 0.001 and (mirror.partner == load_topology().mirror).mean() > 0.999
     R, t = exp(np.array([1.0, 0.5, -2.0])), np.array([1.0, 2, 3])
     turned = person.with_vertices(person.vertices @ R.T + t)
     again = find_skin_mirror(turned)
@@ -67,19 +66,16 @@ def test_the_mirror_image_moves_with_the_body(person, mirror):
     assert off.max() < 0.002 and np.linalg.norm(posed.vertices - person.vertices, axis=1).max() > 0.3
 
 
-def test_who_does_not_stand_symmetrically_needs_landmarks(person):
+def test_who_does_not_stand_symmetrically_is_refused(person):
     body = person.with_vertices(SyntheticPerson().in_pose(np.random.default_rng(0).normal(0, 0.4, (16, 3))))
-    with pytest.raises(ValueError, match=r"template: expected one that stands symmetrically, .* landmarks"):
+    with pytest.raises(ValueError, match=r"template: expected one that stands symmetrically, .* labels"):
         find_skin_mirror(body)
-    with pytest.raises(ValueError, match="landmarks: expected at least 3 pairs of left and right, found 1 among"):
-        find_skin_mirror(person, landmarks={"LELB": 3, "RELB": 5, "C7": 9})
 
 
 @pytest.mark.parametrize("name", layout_names())
 def test_places_tell_what_labels_tell(name, person, mirror):
     layout = load_layout(name, person)
     by_label = label_pairs(layout.labels)
-    np.testing.assert_array_equal(label_pairs(layout.labels), by_label)
     numbered = MarkerLayout(tuple(f"marker {i}" for i in range(len(layout.labels))), layout.vertices)
     by_place = marker_pairs(numbered, person, mirror)
     told = by_place >= 0

@@ -7,13 +7,10 @@ import numpy as np
 import pytest
 import trimesh
 from people_bodies import kept, small_people
-from quiet_pictures import render
-from scene_reader import scenes_of
 
 from completion.__main__ import main
 from completion.measuring import template
 from completion.measuring.bodies import read_bodies
-from completion.measuring.page import measures_page
 from completion.partial.completion import Completion
 from model import find_tapes, measure
 from model.measurement.catalogue import CATALOGUE
@@ -22,7 +19,6 @@ from scanprep import Mesh, RegisteredSet, read_mesh, write_mesh
 from scanprep.decimation.decimate import fast_collapses
 from scanprep.geometry.landmark_names import landmark_name, translate_landmarks
 from scanprep.judgement import Judgement
-from scanprep.pictures import scene
 from scanprep.synthetic.landmarks import landmarks
 from scanprep.synthetic.people import BodyShape, SyntheticPerson
 
@@ -80,20 +76,6 @@ def test_a_folder_and_betas_with_their_model(folder, tmp_path, capsys):
     assert "NaN" not in report and json.loads(report)["judgement"]["verdict"] == "good"
 
 
-def test_every_body_is_on_the_page(monkeypatch):
-    """Three in a figure, six in a table; of very many all are in the tables."""
-    monkeypatch.setattr(scene, "render", render)
-    model = small_people()
-    tapes = find_tapes(model.template, model.info["landmarks"])
-    read = measure(model.template.vertices, tapes)
-    for count, drawn in ((10, [3, 3, 3, 1]), (26, [3] * 8)):
-        names = [f"body {k}" for k in range(count)]
-        page = measures_page(names, [model.template.vertices] * count, [read] * count, tapes).html()
-        assert [len(scene.header["panes"]) for scene in scenes_of(page)] == drawn
-        assert all(page.count(f"<th>{name}</th>") == 1 for name in names)
-        assert ("Drawn are the first 24 of 26 bodies." in page) == (count == 26)
-
-
 TAPES = ("stature", "chest_girth", "hip_girth", "thigh_girth_left", "calf_girth_right", "foot_length_left")
 
 
@@ -112,20 +94,6 @@ def test_a_model_with_the_ten_landmarks_of_the_readme_is_measured(folder, tmp_pa
     ten, full = (table(tmp_path / f"{name}.csv")["rest"] for name in ("ten", "model"))
     for name in TAPES:
         assert float(ten[name]) == pytest.approx(float(full[name]), abs=0.012), name
-
-
-@pytest.mark.slow
-def test_a_set_made_without_landmarks_is_measured(tmp_path):
-    """Its landmark file is empty: all are looked for, and on the built-in people they are known."""
-    person = SyntheticPerson().mesh
-    RegisteredSet.create(tmp_path / "set", person).add("anna", person)
-    (tmp_path / "set" / "landmarks.json").write_text("{}")
-    (tmp_path / "none.json").write_text("{}")
-    for name, words in (("set", ()), ("file", ("--landmarks", tmp_path / "none.json"))):
-        assert scape(tmp_path / "set", *words, "-o", tmp_path / f"{name}.csv") == 0
-        row = table(tmp_path / f"{name}.csv")["anna"]
-        assert float(row["stature"]) == pytest.approx(np.ptp(person.vertices[:, 2]) + 0.005, abs=0.002)  # legs straight
-        assert all(float(row[f"{c}_error"]) > 0 for c in CATALOGUE)
 
 
 def test_a_registered_half_view_is_less_known_than_a_whole_scan(tmp_path):
@@ -147,28 +115,6 @@ def test_what_is_no_person_has_no_landmarks_to_measure_from(tmp_path, capsys):
     write_mesh(tmp_path / "ball.ply", Mesh(ball.vertices, ball.faces))
     assert scape(tmp_path / "ball.ply", "-o", tmp_path / "m.csv") == 1
     assert "measuring begins at landmarks of the template, and there are none" in capsys.readouterr().err
-
-
-@pytest.mark.slow
-def test_without_a_model_a_pose_is_told(folder, tmp_path, capsys, monkeypatch):
-    """Where the built-in people do not come to lie on the template, nobody can be brought to stand."""
-    monkeypatch.setattr(template, "lay_people", lambda mesh: None)
-    rest, bent = (folder / "bodies" / f"{name}.ply" for name in ("rest", "bent"))
-    assert scape(rest, bent, "--landmarks", folder / "marks.json", "-o", tmp_path / "m.csv") == 0
-    said = capsys.readouterr().err
-    assert "LOOK AT THE RESULT: bent: the left shin is turned by 49 degrees" in said, said
-    assert "name the model with -m" in said
-    assert table(tmp_path / "m.csv")["bent"]["note"].startswith("the left shin is turned by")
-
-
-@pytest.mark.slow
-def test_a_set_and_people_who_are_known_by_their_triangles(folder, tmp_path):
-    person = SyntheticPerson(BodyShape.like(weight=1.0))
-    bodies = RegisteredSet.create(tmp_path / "set", person.mesh)
-    bodies.add("one", person.mesh, subject="a")
-    assert scape(tmp_path / "set", "-o", tmp_path / "set.csv") == 0
-    row = table(tmp_path / "set.csv")["one"]
-    assert float(row["stature"]) == pytest.approx(person.anatomy.stature, abs=0.005) and row["note"] == ""
 
 
 @pytest.mark.slow
@@ -264,22 +210,7 @@ def test_a_hole_leaves_a_cell_empty(folder, tmp_path, capsys):
 
 
 @pytest.mark.slow
-def test_percentiles_of_a_sex(folder, tmp_path, capsys):
-    """The table, the figures and the page compare with the survey; without --sex nothing of it is there."""
-    assert scape(folder / "bodies" / "rest.ply", "-m", folder / "model.npz", "--sex", "male", "-o",
-                 tmp_path / "m.csv") == 0
-    row = table(tmp_path / "m.csv")["rest"]
-    true = percentiles({"stature": float(row["stature"]), "thigh_girth_left": float(row["thigh_girth_left"])}, "male")
-    assert float(row["stature_percentile"]) == pytest.approx(true["stature"], abs=0.3)
-    assert float(row["thigh_girth_left_percentile"]) == pytest.approx(true["thigh_girth_left"], abs=0.3)
-    assert "knee_girth_left_percentile" not in row, "the survey has none"
-    assert "of men" in capsys.readouterr().out
-    page = (tmp_path / "m.html").read_text(encoding="utf-8")
-    assert f"({ordinal(true['stature'])})" in page and "4,082 men of ANSUR II" in page
-
-
-@pytest.mark.slow
-def test_the_weight_of_a_closed_body_is_told_with_its_error(folder, tmp_path, capsys):
+def test_percentiles_of_a_sex_and_the_weight_of_a_closed_body(folder, tmp_path, capsys):
     """985 kg in a cubic metre, give or take 2%; an open one has none, and is good all the same."""
     model = small_people()
     body = model.template.with_vertices(model.vertices(np.zeros((16, 3))))
@@ -291,6 +222,12 @@ def test_the_weight_of_a_closed_body_is_told_with_its_error(folder, tmp_path, ca
     assert spread < float(row["weight_error"]) < np.hypot(spread, skin)
     assert float(row["weight_percentile"]) == pytest.approx(
         percentiles({"weight": float(row["weight"])}, "male")["weight"], abs=0.1)
+    true = percentiles({"stature": float(row["stature"])}, "male")
+    assert float(row["stature_percentile"]) == pytest.approx(true["stature"], abs=0.3)
+    assert "knee_girth_left_percentile" not in row, "the survey has none"
+    assert "of men" in capsys.readouterr().out
+    page = (tmp_path / "m.html").read_text(encoding="utf-8")
+    assert f"({ordinal(true['stature'])})" in page and "4,082 men of ANSUR II" in page
     crown = int(body.vertices[:, 2].argmax())
     write_mesh(tmp_path / "bald.ply", type(body)(body.vertices, body.faces[~(body.faces == crown).any(axis=1)]))
     capsys.readouterr()

@@ -10,7 +10,7 @@ from completion.mocap.artefacts.results import write_virtual
 from completion.mocap.files.c3d_points import add_points
 from completion.mocap.files.markers import MarkerFileError, MarkerSequence, read_markers, write_markers
 from completion.mocap.files.motion_files import joint_centres, write_motion_folder
-from completion.mocap.files.opensim import centre_labels, unlike, write_mot
+from completion.mocap.files.opensim import write_mot
 from completion.mocap.joint_angles import JointAngles, anatomy, angles_of, decompose, ground_axes
 from completion.motion import Motion
 from scanprep.geometry.rotations import exp, log, wrap_angle
@@ -311,13 +311,6 @@ def test_joint_centres_are_further_points_of_the_c3d(tmp_path, original):
         add_points(original, data.replace(b"POINT", b"PLINT"), ["a"], ["a"], np.zeros((T, 1, 3)))
     with pytest.raises(MarkerFileError, match="expected a file of 3 frames, found 12"):
         add_points(original, data, ["a"], ["a"], np.zeros((3, 1, 3)))
-
-
-def test_labels_of_joints_are_what_hangs_there():
-    labels = centre_labels(SKELETON)
-    assert {"hip_r_joint", "knee_l_joint", "ankle_r_joint", "shoulder_l_joint", "head_joint"} <= {*labels}
-    assert len(labels) == 15 and not any("pelvis" in label for label in labels)
-    assert unlike(("a", "b", "a"), ("a",)) == ["a_", "b", "a__"]
 
 
 def test_opensim_reads_them(tmp_path):

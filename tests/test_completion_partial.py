@@ -2,12 +2,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from completion_bodies import half_view, worm_with_prior
+from completion_bodies import MARKS, POSE, TRANS, half_view, worm_with_prior
 
-from completion.partial import completion as completing
-from completion.partial.completion import complete, load_completion
+from completion.partial.completion import complete
 from completion.partial.settings import CompletionConfig
-from model.fitting import energy
 from model.fitting.bodies import FixedBody
 from model.fitting.free_space import Contact
 from model.fitting.limbs import limb_runs, redrawn
@@ -15,12 +13,8 @@ from model.priors import gaussian_prior
 from scanprep.geometry import rotations
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.surface import Surface
-from scanprep.registration.ground import Grounded
 
-POSE = np.array([[0.3, -0.5, 0.8], [0.2, 0.5, -0.4], [-0.1, -0.6, 0.3], [0.3, 0.1, 0.5]])
-TRANS = np.array([0.4, -0.3, 1.1])
 BETAS = np.array([1.2, -0.8, 0.5])
-MARKS = np.array([6, 75, 130, 200, 255, 330, 396])
 QUICK = CompletionConfig(random_starts=12, rounds=6, scan_points=800, model_points=300)
 
 
@@ -60,11 +54,6 @@ def test_half_a_scan_gives_the_whole_body(known):
     assert set(result.energies) >= {"landmarks", "pose_prior", "scan_planes"}
 
 
-def test_progress_ends_at_the_total(known):
-    ticks = known[5]
-    assert ticks == sorted(ticks) and ticks[-1][0] == ticks[-1][1]
-
-
 def test_the_completed_mesh_follows_the_scan_where_the_model_cannot(model, known):
     """A dent that no pose of the model makes is there in the completed mesh and not in the predicted one."""
     body, points, _, landmarks, _, _ = known
@@ -79,18 +68,6 @@ def test_the_completed_mesh_follows_the_scan_where_the_model_cannot(model, known
         return Surface(mesh).closest(dented[deep]).distances.mean()
 
     assert at(result.completed) < 0.003 < 0.006 < at(result.predicted)
-
-
-def test_soles_that_come_to_rest_on_a_floor_are_told(model, known, monkeypatch, tmp_path):
-    """The completed mesh is the one that stands, and the files say what was done."""
-    _, points, _, landmarks, result, _ = known
-    monkeypatch.setattr(completing, "put_on_floor", lambda reference, body, foot, points, normals: Grounded(
-        body.vertices + 0.01, None, (0.022, 0.001)))
-    stands = complete(model.subject(None), points, landmarks, QUICK)
-    np.testing.assert_allclose(stands.completed.vertices, result.completed.vertices + 0.01)
-    assert result.soles is None and stands.soles == (0.022, 0.001)
-    assert load_completion(stands.save(tmp_path)).soles == (0.022, 0.001)
-    assert load_completion(result.save(tmp_path)).soles is None
 
 
 def test_a_mesh_with_borders_serves_as_scan(model, known):
@@ -194,7 +171,3 @@ def test_a_part_inside_another_is_pushed_out(model):
     # what is inside at rest, as bones of a finger with a short one between, says nothing
     folded = Contact(model.skeleton, part, mesh.vertices, mesh.vertex_normals)
     assert not folded.violation(mesh.vertices, mesh.vertex_normals).excess.any()
-
-
-def test_robust_weight_is_one_at_zero_and_a_quarter_at_its_scale():
-    np.testing.assert_allclose(energy.geman_mcclure(np.array([0, 0.02, np.inf]), 0.02), [1, 0.25, 0])

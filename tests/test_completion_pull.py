@@ -8,7 +8,7 @@ from model.fitting import energy
 from model.fitting.bodies import FixedBody, ShapedBody
 from model.fitting.limbs import nearest_squared
 from model.fitting.pull import MatchTargets
-from scanprep.geometry.least_squares import Residual, levenberg_marquardt, normal_equations
+from scanprep.geometry.least_squares import Residual, normal_equations
 
 RNG = np.random.default_rng(3)
 IDS, MATCHED = np.array([3, 90, 91, 200, 310, 395]), np.array([200, 3, 90, 200, 310, 90])
@@ -36,26 +36,6 @@ def test_one_residual_of_three_rows_is_that_of_place_and_plane(body):
     for ours, theirs in zip(pull.equations(x[None], nothing).dense, plain, strict=True):
         np.testing.assert_allclose(ours, theirs, atol=1e-9)
     assert sum(part.sum() for part in pull.energies(x)) == pytest.approx(plain.energy[0])
-
-
-def test_a_matrix_is_assembled_only_where_a_step_is_taken():
-    body = BODIES["known"]
-    x, asked = unknowns(body), []
-    near = body.near(IDS, x)
-
-    class Counted:
-        positions = staticmethod(near.positions)
-
-        @staticmethod
-        def columns(x):
-            asked.append(x)
-            return near.columns(x)
-
-    pull = MatchTargets(Counted, np.arange(6), TARGETS, NORMALS, TO_POINT, TO_PLANE)
-    held = np.ones(len(x))
-    found = levenberg_marquardt(lambda at: pull.equations(at, normal_equations([energy.stay_near(at, x, held)])),
-                                x[None], 1)
-    assert found.iterations == len(asked) == 1 and found.x.shape == x[None].shape
 
 
 def test_few_vertices_of_a_body_are_those_of_the_whole():

@@ -3,7 +3,6 @@ import pytest
 from completion_bodies import half_view, worm_with_prior
 
 from model.fitting.free_space import find_camera
-from model.fitting.named_points import distinct_bodies
 from model.fitting.scan import prepare_scan, spread_points
 from scanprep.geometry import rotations
 from scanprep.geometry.mesh import Mesh
@@ -104,12 +103,6 @@ def test_nothing_stands_beside_or_in_front_of_what_was_seen(body, view):
     assert excess[2] > 0.2
     np.testing.assert_allclose(points - excess[:, None] * normal, target, atol=1e-12)
     assert (seen_from.violation(target).excess <= 0.3 * excess + 1e-9).all()
-
-
-def test_distinct_bodies_are_kept_in_order():
-    places = np.array([0, 0.001, 0.1, 0.101, 0.3])[:, None, None] * np.ones((5, 7, 3))
-    assert distinct_bodies(places, 2) == [0, 2]
-    assert distinct_bodies(places, 9) == [0, 2, 4]
 
 
 @pytest.mark.parametrize("share", [0.05, 0.3])

@@ -7,11 +7,9 @@ from completion_bodies import half_view, worm_with_prior
 from completion.partial.completion import complete
 from completion.partial.settings import CompletionConfig
 from model.fitting.bodies import FixedBody
-from model.fitting.free_space import Outside, find_camera
-from model.fitting.limbs import examples_of
 from model.fitting.scan import prepare_scan
 from model.fitting.scan_fit import scan_fit
-from model.fitting.starts import AXES, all_rotations, coarse_cost, from_nothing, pick_varied, placements, starting_poses
+from model.fitting.starts import AXES, all_rotations, from_nothing, placements, starting_poses
 from scanprep.geometry import rotations
 from scanprep.geometry.surface import Surface
 
@@ -45,33 +43,6 @@ def test_turns_are_rotations_that_leave_no_gap():
     cosine = (np.einsum("aij,bij->ab", any_turn, turns).max(axis=1) - 1) / 2
     assert np.degrees(np.arccos(cosine.min())) < 35                       # of any turn, one is near
     assert np.degrees(np.arccos(cosine.mean())) < 20
-
-
-def test_varied_poses_are_the_corners():
-    poses = np.zeros((9, 2, 3))
-    poses[:, 1, 0] = [0, 0.1, 0.2, -0.1, 1, 0.9, -1, -0.95, 0.05]
-    np.testing.assert_array_equal(pick_varied(poses, 3)[:, 1, 0], [0, 1, -1])
-    assert pick_varied(poses, 9) is poses
-
-
-def test_the_table_says_what_the_camera_denies(scene):
-    _, points = scene
-    camera = find_camera(prepare_scan(points))
-    table = Outside([camera])
-    places = points[::40] + np.random.default_rng(0).normal(0, 0.1, (len(points[::40]), 3))
-    there = np.minimum(camera.violation(places).excess, 0.15)
-    assert np.abs(table.at(places) - there).mean() < 0.015               # cells are 5 cm wide
-    assert table.at(points[:1] + 10)[0] == pytest.approx(0.15)
-
-
-def test_a_glance_tells_the_body_of_the_scan_from_others(model, scene):
-    fit = scan_fit(FixedBody(model.subject(None)), prepare_scan(scene[1]), *NOTHING, QUICK)
-    x = np.repeat(fit.body.join(POSE, TRANS)[None], 40, axis=0)
-    x[1:, 3:12] += np.random.default_rng(1).normal(0, 0.3, (39, 9))
-    cost = coarse_cost(fit, x)
-    misfit = np.array([fit.misfit(one) for one in x])
-    assert cost.argmin() == misfit.argmin() == 0
-    assert np.corrcoef(cost.argsort().argsort(), misfit.argsort().argsort())[0, 1] > 0.9
 
 
 def test_neighbouring_twists_are_damped_and_the_root_is_not(model, scene):
@@ -116,15 +87,6 @@ def test_a_scan_turned_is_found_as_well(model, scene):
     R, t = rotations.exp(np.array([1.7, -1.1, 0.4])), np.array([3.0, -2, 1])
     result = complete(model.subject(None), points @ R.T + t, None, QUICK)
     assert Surface(result.completed).closest(body.vertices @ R.T + t).distances.mean() < 0.015
-
-
-def test_limbs_are_drawn_from_the_training_poses(model):
-    body, x = FixedBody(model.subject(None)), np.arange(15.0)
-    drawn = examples_of(body, x, 2, 40, np.random.default_rng(0))
-    np.testing.assert_array_equal(drawn[:, [*range(6), 12, 13, 14]], np.tile(x[[*range(6), 12, 13, 14]], (40, 1)))
-    wanted = model.pose_examples[np.arange(40) % 20, 2:].reshape(40, -1)
-    assert 0.05 < (drawn[:, 6:12] - wanted).std() < 0.15
-    assert len(examples_of(FixedBody(worm_with_prior().subject(None)), x, 2, 40, np.random.default_rng(0))) == 0
 
 
 @pytest.mark.slow

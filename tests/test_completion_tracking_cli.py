@@ -1,12 +1,6 @@
 import json
-import os
 import shutil
-import signal
-import subprocess
-import sys
-import time
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -18,7 +12,6 @@ from trees import tree
 from completion import Motion
 from completion.tracking import cli, report
 from completion.tracking.folder import FrameFolder
-from completion.tracking.report import _ranges
 from completion.tracking.sequence import BodyTracker
 from model import load_model
 from scanprep.batch.workspace import HOME
@@ -86,10 +79,6 @@ def test_a_bad_file_is_a_camera_that_saw_nothing_and_is_named_once(tmp_path):
     assert len(found.problems) == 1 and "2.ply" in found.problems[0]
 
 
-def test_runs_of_numbers_are_told_as_ranges():
-    assert _ranges(np.array([3, 4, 5, 9, 11, 12])) == "3 to 5, 9, 11 to 12"
-
-
 @pytest.fixture(scope="module")
 def recording(tmp_path_factory):
     """Where a recording is, and its bodies."""
@@ -129,31 +118,6 @@ def test_the_command_writes_all_it_promises(recording, output):
     surfaces = sorted((output / "surfaces").iterdir())
     assert [p.name for p in surfaces] == [f"{i:06d}.ply" for i in range(FRAMES)]
     assert len(read_mesh(surfaces[0], "m").faces) == len(model.template.faces)
-
-
-@pytest.mark.slow
-def test_killed_in_the_first_frames_and_started_again(recording, tmp_path, capfd, monkeypatch):
-    """The shape is found from frames of two chunks; the run is killed after the first."""
-    monkeypatch.setattr(report, "track_page", quick_page)
-    out, shaped = tmp_path / "out", ("--shape-frames", 7)
-    assert call(recording, tmp_path / "whole", *shaped) == 0
-    program = [sys.executable, str(Path(__file__).with_name("recordings.py")), *arguments(recording[0], out, *shaped)]
-    child = subprocess.Popen(program, start_new_session=True, stderr=subprocess.DEVNULL)
-    deadline = time.monotonic() + 120
-    while not (out / HOME / "done" / "frames%2F00000000.npz").exists():
-        assert child.poll() is None and time.monotonic() < deadline
-        time.sleep(0.005)
-    os.kill(child.pid, signal.SIGSTOP)                  # it still holds the output
-    capfd.readouterr()
-    assert call(recording, out, *shaped) == 1 and "another run is at work" in capfd.readouterr().err
-    os.kill(child.pid, signal.SIGKILL)
-    child.wait()
-    assert not (out / "motion.npz").exists()
-    assert call(recording, out, *shaped) == 0
-    assert f"5 of {FRAMES} frames were tracked before" in capfd.readouterr().err
-    assert contents(out) == contents(tmp_path / "whole")
-    betas = Motion.load(out / "motion.npz").betas
-    assert betas.shape == (3,) and np.abs(betas).max() > 0
 
 
 @pytest.fixture
@@ -200,14 +164,6 @@ def test_a_changed_frame_is_followed_anew_with_those_after_it(again):
         "surfaces/000007.ply", "surfaces/000008.ply"}
     assert track(*arguments(folder, out.with_name("anew"), *KNOWN)) == 0
     assert contents(out) == contents(out.with_name("anew"))
-
-
-def test_damaged_frames_are_followed_again_and_nothing_else(again):
-    folder, out, numbers = again
-    before, kept = contents(out), out / HOME / "done" / "frames%2F00000000.npz"
-    kept.write_bytes(kept.read_bytes()[:-200])
-    assert track(*arguments(folder, out, *KNOWN)) == 0
-    assert numbers == [0, 1, 2, 3, 4] and contents(out) == before
 
 
 def test_a_shorter_recording_leaves_nothing_behind(again):

@@ -10,9 +10,8 @@ from completion.partial.completion import complete
 from model.fitting.bodies import as_body
 from model.fitting.free_space import find_cameras, free_space_violation
 from model.fitting.scale import LOOSE, ScaledBody, landmark_scale, rough_scale
-from model.fitting.scan import as_views, prepare_scan
+from model.fitting.scan import prepare_scan
 from scanprep.geometry.files import PointCloud
-from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.surface import Surface
 
 BETAS = np.array([1.2, -0.8, 0.5])
@@ -131,11 +130,6 @@ def test_views_that_cannot_be_used_are_refused(scan, viewpoint, message):
         prepare_scan(scan, viewpoint)
 
 
-def test_lists_of_numbers_are_one_view():
-    assert [view.shape for view in as_views([[0, 0, 1], [1, 2, 3]])] == [(2, 3)]
-    assert len(as_views([np.zeros((2, 3)), np.zeros((4, 3))])) == 2
-
-
 # ---- scans of unknown unit
 
 
@@ -191,14 +185,3 @@ def test_how_far_a_scan_extends_says_roughly_how_large_it_is(model, body, views)
     assert rough[1] == pytest.approx(rough[0] / 40, rel=1e-6)
     assert 0.75 < rough[0] < 1.3 and 0.8 < rough[2] < 1.25
     assert landmark_scale(posed, MARKS, body.vertices[MARKS] / 1.2, QUICK) == pytest.approx(1.2, rel=0.05)
-
-
-def test_meshes_and_their_viewpoints_are_scaled_together(body, views):
-    seen = views[0][1]
-    view = body.submesh(seen[body.faces].all(axis=1))[0]
-    small = prepare_scan(Mesh(1000 * view.vertices, view.faces), 1000 * cameras(body)[0], metres=0.001)
-    here = prepare_scan(view, cameras(body)[0])
-    np.testing.assert_allclose(small.points, here.points, atol=1e-12)
-    np.testing.assert_allclose(small.normals, here.normals, atol=1e-9)
-    np.testing.assert_allclose(small.viewpoints, here.viewpoints)
-    assert small.scale_by(2).spacing == pytest.approx(2 * here.spacing)

@@ -377,7 +377,7 @@ ELSEWHERE = {
     "test_completion_mosh_cli": ("mosh",), "test_completion_tracking_cli": ("track",),
     "test_completion_layout_cli": ("layout show", "layout transfer"), "test_demo": ("demo",),
     "test_sample": ("sample",),
-    "test_completion_label_cli": ("label", "layout find"),
+    "test_completion_label_cli": ("label",),
     "test_completion_marker_selection_cli": ("layout design",), "test_completion_motions": ("model repose",),
     "test_model_statue_cli": ("statue fit", "statue reconstruct", "statue animate")}
 SHOW_ONLY = ("view", "pick", "layout list", "completion")                 # they make nothing of their own

@@ -155,7 +155,7 @@ def test_bash_completes_commands_flags_and_values(capsys, tmp_path):
     (tmp_path / "scape.bash").write_text(capsys.readouterr().out)
 
     def offered(*words):
-        code = f"source scape.bash; COMP_WORDS=({' '.join(words)} ''); COMP_CWORD={len(words)}; _shtab_scape; " \
+        code = f"source scape.bash; COMP_WORDS=({' '.join(words)} ''); COMP_CWORD={len(words)}; _scape; " \
                'echo "${COMPREPLY[@]}"'
         return subprocess.run(["bash", "-c", code], capture_output=True, text=True, cwd=tmp_path).stdout.split()
 

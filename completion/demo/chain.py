@@ -6,28 +6,28 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from contextlib import AbstractContextManager
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 
 import numpy as np
 from scipy.spatial import cKDTree
 
-from model import BodyModel, LearnConfig, Subject, fit_pose, learn_scape, load_model
+from model import BodyModel, Subject, fit_pose, learn_scape, load_model
 from model.motion.files import skeleton_arrays
 from scanprep.batch.opening import workspace
 from scanprep.batch.room import TaskContext, substeps
 from scanprep.batch.workspace import KeptSteps, Task, Workspace
 from scanprep.dataset import RegisteredSet
-from scanprep.geometry import storage, tables
+from scanprep.geometry import tables
 from scanprep.geometry.farthest_points import spread_indices
 from scanprep.geometry.files import read_mesh, write_mesh
 from scanprep.geometry.landmarks import match_landmarks, read_landmark_vertices, read_landmarks, write_landmarks
 from scanprep.geometry.mesh import Mesh
+from scanprep.geometry.surface import Surface, SurfacePoints
 from scanprep.pipeline.again import Call
 from scanprep.pipeline.prepare import SCANS, Prepared, prepare
 from scanprep.pipeline.scans import TABLE, find_scans
-from scanprep.ranges import Cell, Count, Faces, Positive, Seed, Settings
 from scanprep.surfaces.template import TemplateConfig, template_of_views
 from scanprep.synthetic.data_set import (
     SUBJECT,
@@ -49,47 +49,28 @@ from ..mocap.marker_sets.layout import DISTANCE, MarkerLayout
 from ..mocap.pose.follow import animate
 from ..motion import Motion
 from ..partial.completion import Completion, complete, load_completion
-from .sample import MARKER_NOISE, record_markers
-from .truth import TruthMap, distance, surface_error
+from .sample import record_markers
+from .truth import distance, surface_error
 
 
 @dataclass(frozen=True)
-class DemoConfig(Settings):
-    """How much of everything.
+class Amounts:
+    """How much of everything."""
 
-    Attributes
-    ----------
-    poses, subjects : int
-        Scans of one subject in many poses, and of other people.
-    faces : int
-        Triangles of the template.
-    resolution, template_resolution : float, metres
-        Spacing of the scanner's rays, for the scans and for the careful one that the template is made of.
-    held_out : int
-        Poses of the subject that the model never saw.
-    frames, rate : int, frames per second
-        Of the walk.
-    seed : int
-    learn : LearnConfig
-        How the model is learned.
-    """
-
-    poses: Count = 9
-    subjects: Count = 4
-    faces: Faces = 8000
-    resolution: Cell = 0.01
-    template_resolution: Cell = 0.0055
-    held_out: int = 3
-    frames: Count = 66
-    rate: Positive = 60.0
-    seed: Seed = 0
-    learn: LearnConfig = field(default_factory=LearnConfig)
+    poses: int                           # scans of one subject in many poses
+    subjects: int                        # scans of other people
+    faces: int                           # triangles of the template
+    resolution: float                    # metres: spacing of the scanner's rays
+    template_resolution: float           # the same of the careful scan that the template is made of
+    held_out: int                        # poses of the subject that the model never saw
+    frames: int = 66                     # of the walk
+    rate: float = 60.0                   # frames per second of the walk
 
 
-# --full and --quick: more and finer scans for better figures, or fewer for a first look
-FULL = DemoConfig(poses=20, subjects=12, faces=14000, resolution=0.0068, template_resolution=0.004, held_out=5,
-                  frames=132)
-QUICK = DemoConfig(poses=8, subjects=3, faces=7000, resolution=0.011, template_resolution=0.006, held_out=2, rate=30.0)
+# about three minutes on two cores; --full and --quick: more and finer scans, or fewer for a first look
+USUAL = Amounts(poses=9, subjects=4, faces=8000, resolution=0.01, template_resolution=0.0055, held_out=3)
+FULL = Amounts(poses=20, subjects=12, faces=14000, resolution=0.0068, template_resolution=0.004, held_out=5, frames=132)
+QUICK = Amounts(poses=8, subjects=3, faces=7000, resolution=0.011, template_resolution=0.006, held_out=2, rate=30.0)
 
 # files of the stages inside the folder
 MODEL, HALF, MOTION = Path("model.npz"), Path("half_view/half_view.ply"), Path("animation/motion.npz")
@@ -112,7 +93,8 @@ class Demo:
     """One run of the demonstration in its folder."""
 
     space: Workspace
-    config: DemoConfig
+    amounts: Amounts
+    seed: int
     # bar(title) is a context manager that yields a progress callback
     bar: Callable[[str], AbstractContextManager[Callable[[int, int], None]]]
 
@@ -124,15 +106,15 @@ class Demo:
     @property
     def scanner(self) -> ScannerConfig:
         """The virtual scanner."""
-        return ScannerConfig(resolution=self.config.resolution)
+        return ScannerConfig(resolution=self.amounts.resolution)
 
     @cached_property
     def scans(self) -> list[SyntheticScan]:
         """Scans of one subject in many poses, and of many subjects."""
         tasks = [Task(f"{SCANS}{'pose' if which[1] else 'person'} {which[0]}", which)
-                 for which in scan_plan(self.config.poses, self.config.subjects)]
+                 for which in scan_plan(self.amounts.poses, self.amounts.subjects)]
         with self.bar("scanning people") as progress, one_thread():
-            done = self.space.run(ScanPerson(self.config.seed, self.scanner), tasks, progress=progress)
+            done = self.space.run(ScanPerson(self.seed, self.scanner), tasks, progress=progress)
         if done.failures:
             raise ValueError("; ".join(done.failures.values()))
         for name in set(self.space.list_results(SCANS)) - set(done.values):         # left by a run with more scans
@@ -141,43 +123,35 @@ class Demo:
         rows = [(s.name, s.subject, s.pose, s.sex) for s in scans]
 
         def write(folder: Path) -> None:
-            """Write the settings, and the table of who is in the scans."""
-            storage.write_json(folder / "demo.json", storage.as_json(self.config))
             (folder / "scans").mkdir()
             tables.write_table(folder / "scans" / TABLE, ("name", "subject", "pose", "sex"), rows)
 
-        self.space.step("settings", (self.config, rows), write)
+        self.space.step("table", rows, write)
         return scans
 
     @cached_property
     def template(self) -> Mesh:
         """The template: a careful scan of the subject at rest from many sides, merged, holes filled, decimated."""
         # twelve views also from above and below, and deep into narrow places, so that hands get fingers
-        scanner = ScannerConfig(views=12, resolution=self.config.template_resolution, height=1.2, blind_reach=0.01)
+        scanner = ScannerConfig(views=12, resolution=self.amounts.template_resolution, height=1.2, blind_reach=0.01)
         settings = TemplateConfig()
-        settings = replace(settings, merge=replace(settings.merge, voxel=self.config.template_resolution))
+        settings = replace(settings, merge=replace(settings.merge, voxel=self.amounts.template_resolution))
 
         def make(folder: Path) -> None:
             """Scan the subject, merge the views and write the template."""
-            rng = np.random.default_rng([self.config.seed, 6])
+            rng = np.random.default_rng([self.seed, 6])
             with self.bar("making the template") as progress:
                 careful = scan(self.rest.mesh, scanner, rng)
                 marks = click_landmarks(self.rest, rng, seen=careful.merged.vertices)
                 place = folder / "template_scan"
                 write_scan(place, "rest", careful, self.rest, marks)
                 views = read_views(place / "views" / "rest.npz")
-                # in the form that `scape prep template` reads: a mesh per view, and the positions of the cameras
-                named = {f"view_{k:02d}": view for k, view in enumerate(views)}
-                for name, view in named.items():
-                    write_mesh(place / "range_views" / f"{name}.ply", view.mesh)
-                storage.write_json(place / "range_views" / "cameras.json",
-                                   {name: view.camera.tolist() for name, view in named.items()})
-                mesh = template_of_views(views, self.config.faces, settings, progress)
+                mesh = template_of_views(views, self.amounts.faces, settings, progress)
             landmarks = read_landmark_vertices(place / "rest.landmarks.json", mesh)
             write_landmarks(folder / "template.landmarks.json", landmarks)
             write_mesh(folder / "template.ply", mesh)
 
-        self.space.step("template", (self.config.seed, self.config.faces, scanner, settings), make)
+        self.space.step("template", (self.seed, self.amounts.faces, scanner, settings), make)
         return read_mesh(self.folder / "template.ply")
 
     @cached_property
@@ -197,9 +171,7 @@ class Demo:
         tasks = find_scans(self.folder / "scans")
         with workspace(self.folder / "set", self.space.force) as space:
             stale = set(space.list_results(SCANS)) - {SCANS + task.name for task in tasks}
-            if stale:                                           # tables first, as they refer to the scans
-                space.drop("tables")
-            for name in stale:
+            for name in ["tables", *stale] if stale else []:    # tables first, as they refer to the scans
                 space.drop(name)
             with self.bar("registering scans") as first, self.bar("finding the skeleton") as second:
                 done = prepare(tasks, template, marks, space.folder, None, first, second)
@@ -218,10 +190,10 @@ class Demo:
 
         def make(folder: Path) -> None:
             with self.bar("learning the model") as progress:
-                model = learn_scape(*bodies, self.config.learn, progress, substeps(KeptSteps(self.space), "model"))
+                model = learn_scape(*bodies, None, progress, substeps(KeptSteps(self.space), "model"))
             replace(model, info={**model.info, "landmarks": self.template_landmarks}).save(folder / MODEL)
 
-        self.space.step("model", (bodies, self.config.learn, self.template_landmarks), make)
+        self.space.step("model", (bodies, self.template_landmarks), make)
         self.space.drop_others("model/")
         return load_model(self.folder / MODEL)
 
@@ -235,7 +207,7 @@ class Demo:
         """By scan: distances (N,), metres, of every registered vertex to the true surface, and to its true place."""
         registered, truths = self.prepared.registered, {s.name: GroundTruth.load(s.truth) for s in self.scans}
         return {name: (surface_error(self.template.with_vertices(vertices), truths[name]),
-                       distance(vertices, self.truth_map.vertices(truths[name])))
+                       distance(vertices, self.true_places(truths[name])))
                 for name, vertices in zip(registered.names, registered.vertices(), strict=True)}
 
     @cached_property
@@ -246,85 +218,82 @@ class Demo:
     @cached_property
     def held_out(self) -> list[GroundTruth]:
         """Poses of the subject that were never scanned."""
-        rng = np.random.default_rng([self.config.seed, 7])
-        return [stand(self.person, random_pose(rng)) for _ in range(self.config.held_out)]
+        rng = np.random.default_rng([self.seed, 7])
+        return [stand(self.person, random_pose(rng)) for _ in range(self.amounts.held_out)]
 
     def fit_pose(self, wanted: np.ndarray) -> np.ndarray:
         """Compute the model's vertices (N, 3) in the pose that comes closest to `wanted` (N, 3)."""
         return fit_pose(self.subject, wanted).vertices
 
     @cached_property
+    def unseen(self) -> Path:
+        """The folder, with what the model makes of people whom it never saw: a half view completed, a walk followed."""
+        self.space.step("unseen", (self.folder / MODEL, self.template_landmarks, self.amounts, self.seed),
+                        self._make_unseen)
+        return self.folder
+
+    def _make_unseen(self, folder: Path) -> None:
+        """Scan a held-out pose from one side, complete it, record a walk and follow its markers."""
+        # what one camera sees of the first held-out pose, with seven landmarks that somebody clicks
+        truth, rng = self.held_out[0], np.random.default_rng([self.seed, 8])
+        seen = scan(truth.mesh, replace(self.scanner, views=1, azimuth=-30.0), rng)
+        marks = click_landmarks(truth, rng, seen=seen.merged.vertices)
+        chosen = np.array(list(marks))[spread_indices(len(marks), 7)]
+        write_scan(folder / HALF.parent, HALF.stem, seen, truth, {name: marks[name] for name in chosen}, views=False)
+        # the whole body from it
+        half, marks = _read_half(folder)
+        _, vertices, points = match_landmarks(self.template_landmarks, marks)
+        with self.bar("completing a half view") as progress:
+            complete(self.subject, half, (vertices, points), progress=progress).save(folder / "completed")
+        # a walk; as with a real subject, the layout is read from the scan at rest, on which the markers are visible
+        with self.bar("recording a walk") as progress:
+            sequence = record_markers(self.walking, self.rest.faces, self.amounts.rate,
+                                      np.random.default_rng([self.seed, 9]), progress)
+        _, vertices = cKDTree(self.template.vertices).query(self.rest.vertices[list(MARKERS.values())])
+        MarkerLayout(tuple(MARKERS), vertices, DISTANCE).save(folder / "markers" / "layout.json")
+        write_markers(folder / "markers" / "walk.c3d", sequence)
+        # the motion that follows its markers
+        with self.bar("following the markers") as progress:
+            motion = animate(self.subject, read_markers(folder / "markers" / "walk.c3d"),
+                             MarkerLayout.load(folder / "markers" / "layout.json"), progress=progress)
+        motion.save(folder / MOTION, **skeleton_arrays(self.subject.rest_skeleton))
+
+    @cached_property
     def half_scan(self) -> tuple[Mesh, dict[str, np.ndarray], GroundTruth]:
         """What one camera sees of the first held-out pose, a few landmarks on it, and the truth."""
-        truth, scanner = self.held_out[0], replace(self.scanner, views=1, azimuth=-30.0)
-
-        landmarks = 7  # number that somebody clicks on the half view
-        def make(folder: Path) -> None:
-            rng = np.random.default_rng([self.config.seed, 8])
-            seen = scan(truth.mesh, scanner, rng)
-            marks = click_landmarks(truth, rng, seen=seen.merged.vertices)
-            chosen = spread_indices(len(marks), landmarks)
-            write_scan(folder / HALF.parent, HALF.stem, seen, truth,
-                       {name: marks[name] for name in np.array(list(marks))[chosen]}, views=False)
-
-        self.space.step("half view", (self.config.seed, scanner, landmarks), make)
-        half = self.folder / HALF
-        return read_mesh(half), read_landmarks(half.with_suffix(".landmarks.json")), truth
+        return *_read_half(self.unseen), self.held_out[0]
 
     @cached_property
     def completion(self) -> Completion:
         """The whole body from the half view."""
-        half, marks, _ = self.half_scan
-        subject = self.subject
-
-        def make(folder: Path) -> None:
-            _, vertices, points = match_landmarks(self.template_landmarks, marks)
-            with self.bar("completing a half view") as progress:
-                complete(subject, half, (vertices, points), progress=progress).save(folder / "completed")
-
-        self.space.step("completion", (self.folder / MODEL, self.folder / HALF, self.template_landmarks, marks), make)
-        return load_completion(self.folder / "completed")
+        return load_completion(self.unseen / "completed")
 
     @cached_property
-    def walk(self) -> tuple[MarkerSequence, MarkerLayout, np.ndarray]:
-        """Markers of the walking subject, their places on the template, and the true vertices (T, N, 3)."""
-        poses, trans = synthesise_walk(self.config.frames, self.config.rate)
-        bodies = np.stack([self.person.in_pose(pose, place) for pose, place in zip(poses, trans, strict=True)])
-        template, config = self.template, self.config
+    def walking(self) -> np.ndarray:
+        """The true vertices (T, N, 3) of the walk."""
+        poses, trans = synthesise_walk(self.amounts.frames, self.amounts.rate)
+        return np.stack([self.person.in_pose(pose, place) for pose, place in zip(poses, trans, strict=True)])
 
-        def make(folder: Path) -> None:
-            with self.bar("recording a walk") as progress:
-                record_walk(folder / "markers", bodies, self.rest, template, config, progress)
-
-        self.space.step("markers", (config.seed, config.frames, config.rate, MARKER_NOISE, template), make)
-        layout = MarkerLayout.load(self.folder / "markers" / "layout.json", len(template.vertices))
-        return read_markers(self.folder / "markers" / "walk.c3d"), layout, bodies
+    @cached_property
+    def walk(self) -> MarkerSequence:
+        """The markers of the walking subject."""
+        return read_markers(self.unseen / "markers" / "walk.c3d")
 
     @cached_property
     def motion(self) -> Motion:
         """The model's motion that follows the markers of the walk."""
-        (sequence, layout, _), subject = self.walk, self.subject
-
-        def make(folder: Path) -> None:
-            with self.bar("following the markers") as progress:
-                motion = animate(subject, sequence, layout, progress=progress)
-            motion.save(folder / MOTION, **skeleton_arrays(subject.rest_skeleton))
-
-        self.space.step("animation", (self.folder / MODEL, self.folder / "markers"), make)
-        return Motion.load(self.folder / MOTION)
+        return Motion.load(self.unseen / MOTION)
 
     @cached_property
-    def truth_map(self) -> TruthMap:
-        """Where the template's vertices truly lie."""
-        return TruthMap.of(self.template, self.rest)
+    def places(self) -> SurfacePoints:
+        """The true surface points nearest to the template's vertices; all people share one triangulation."""
+        return Surface(self.rest.mesh).closest(self.template.vertices)
+
+    def true_places(self, truth: GroundTruth) -> np.ndarray:
+        """Compute the true places (N, 3) of the template's vertices on a person, metres."""
+        return self.places.transfer(truth.vertices, truth.faces)
 
 
-def record_walk(folder: Path, bodies: np.ndarray, rest: GroundTruth, template: Mesh, config: DemoConfig,
-                report_progress: Callable[[int, int], None]) -> None:
-    """Write the markers of a walking person (T, N, 3), and their places on the template."""
-    sequence = record_markers(bodies, rest.faces, config.rate, np.random.default_rng([config.seed, 9]), report_progress)
-    # as with a real subject, the layout is read from the scan at rest, on which the markers are visible
-    _, vertices = cKDTree(template.vertices).query(rest.vertices[list(MARKERS.values())])
-    MarkerLayout(tuple(MARKERS), vertices, DISTANCE).save(folder / "layout.json")
-    write_markers(folder / "walk.csv", sequence)
-    write_markers(folder / "walk.c3d", sequence)
+def _read_half(folder: Path) -> tuple[Mesh, dict[str, np.ndarray]]:
+    """Read the half view and its landmarks."""
+    return read_mesh(folder / HALF), read_landmarks((folder / HALF).with_suffix(".landmarks.json"))

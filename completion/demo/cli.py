@@ -1,7 +1,6 @@
 """The command `scape demo`."""
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 from shlex import quote
 
@@ -11,11 +10,11 @@ from scanprep.console import Outcome, bar
 from scanprep.ranges import Seed
 
 from ..cli import Out
-from .chain import FULL, MODEL, QUICK, Demo, DemoConfig
+from .chain import FULL, MODEL, QUICK, USUAL, Demo
 
 
-def demo(out: Out = Path("scape_demo"), quick: bool = False, full: bool = False, seed: Seed = DemoConfig.seed,
-         *, space: Workspace) -> Outcome:
+def demo(out: Out = Path("scape_demo"), quick: bool = False, full: bool = False, seed: Seed = 0, *,
+         space: Workspace) -> Outcome:
     """The whole chain on the built-in people: scans, registration, skeleton, model, completion, animation.
 
     Example: scape demo
@@ -34,11 +33,14 @@ def demo(out: Out = Path("scape_demo"), quick: bool = False, full: bool = False,
 
     if quick and full:
         raise UsageError("--quick, --full: expected at most one of the two")
-    run = Demo(space, replace(QUICK if quick else FULL if full else DemoConfig(), seed=seed), bar)
+    amounts = USUAL
+    if quick or full:
+        amounts = QUICK if quick else FULL
+    run = Demo(space, amounts, seed, bar)
     metrics = measure_demo(run)
-    judgement = judge_demo(run, metrics)
+    judgement = judge_demo(run)
     with bar("drawing the report") as progress, space.staging("page") as staged:
         write_page(run, metrics, judgement, progress, staged.folder)
-    return Outcome(out, metrics, {"demo": run.config, "model": MODEL}, judgement=judgement,
+    return Outcome(out, metrics, {"demo": amounts, "seed": seed, "model": MODEL}, judgement=judgement,
                    following=f"open {quote(str(out / 'report.html'))} in a browser; then your own scans: "
                    "scape prep run scans --template template.ply -o set")

@@ -1,8 +1,7 @@
 """The page of the demonstration, with a picture of every stage."""
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from functools import partial
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
@@ -15,14 +14,13 @@ from scanprep.geometry.mesh import Mesh
 from scanprep.judgement import Judgement
 from scanprep.pictures.camera import look_around
 from scanprep.pictures.page import Page
-from scanprep.pictures.scene import Pane, picture_panes
-from scanprep.pictures.shading import CLAY, Heat, Solid, part_colors
-from scanprep.pictures.sheets import save_png
+from scanprep.pictures.scene import Pane
+from scanprep.pictures.shading import CLAY, Heat, Solid
 from scanprep.pictures.thinning import thin_solid
 
 from ..mocap.files.motion_files import write_glb
-from ..motion_pictures import chart_residuals, pane_with_dots
-from ..partial.report import COMPLETED, HEIGHT, MEASURED, completion_panes, picture_completion
+from ..motion_pictures import pane_with_dots
+from ..partial.report import HEIGHT, completion_panes
 from .chain import Demo
 from .truth import distance, mean_over_area, surface_error
 
@@ -31,151 +29,73 @@ FAR = 0.01                 # metres at the dark end of the heat maps
 
 def write_page(demo: Demo, metrics: list[Metric], judgement: Judgement,
                report_progress: Callable[[int, int], None], to: Path) -> None:
-    """Write `report.html`, the animated GLB and pictures into a folder."""
+    """Write `report.html` and the animated GLB into a folder."""
     page = Page("From raw scans to a moving person",
                 "Every stage of the chain on the built-in people, whose true shape, pose and correspondence are known.")
     page.verdict(judgement, "Next, your own scans: `scape prep run scans --template template.ply -o set`")
     page.figures(metrics, ("measured against the truth", "value", "unit"))
-    stages: tuple[Callable[[Demo, Page], None], ...] = (
-        _scans, _template, _registration, _skeleton, _shapes, _poses, partial(_completion, to=to),
-        partial(_animation, to=to))
-    for i, stage in enumerate(stages):
-        stage(demo, page)
-        report_progress(i + 1, len(stages))
-    # one picture of the whole chain: scan, registration, parts, body shapes, completion, animation
-    template, model, completion = demo.template, demo.model, demo.completion
-    name = demo.scans[1].name                       # the first pose after rest
-    registered = template.with_vertices(demo.prepared.registered.vertices([name])[0])
-    rest = np.zeros((len(model.skeleton.parents), 3))
-    people = [template.with_vertices(model.vertices(rest, betas)) for betas in (np.array([-1.8]), np.array([1.8]))]
-    walking = demo.motion.vertices(demo.subject, np.array([0, len(demo.motion.poses) // 4]))
-    colors = np.where(completion.seen[:, None], MEASURED, COMPLETED)
-    shown: list[tuple[Mesh | Solid, np.ndarray, float, str]] = [
-        (read_mesh(demo.folder / "scans" / f"{name}.ply"), registered.vertices, 25, "scan"),
-        (registered, registered.vertices, 25, "registered"),
-        (Solid(template, part_colors(model.skeleton.part_of_face)), template.vertices, 0, "parts found"),
-        *((person, np.concatenate([p.vertices for p in people]), 15.0, "body shape") for person in people),
-        (Solid(demo.half_scan[0], MEASURED), completion.completed.vertices, -30, "half a view"),
-        (Solid(completion.completed, colors), completion.completed.vertices, 30, "completed"),
-        *((template.with_vertices(v), v, 40.0, "animated") for v in walking)]
-    save_png(to / "overview.png", picture_panes(
-        [_pane(demo, shape, framed, label, turn) for shape, framed, turn, label in shown], 400))
-    page.write(to / "report.html")
+    for i, (title, text, panes) in enumerate((*_show_scans(demo), *_show_model(demo), *_show_unseen(demo))):
+        page.section(title, text).bodies(panes, height=HEIGHT if len(panes) < 4 else 340)
+        report_progress(i + 1, 8)
+    write_glb(to / "animation" / "walk.glb", demo.motion, demo.subject)
+    page.text("animation/walk.glb, beside this page, plays in any viewer of glTF.").write(to / "report.html")
 
 
-def _pane(demo: Demo, shape: Mesh | Solid, fits: np.ndarray, label: str, turn: float = 25.0) -> Pane:
-    """Make a pane of a shape, framed like the vertices `fits`, seen from `turn` degrees beside the front."""
+def _pane(demo: Demo, shape: Mesh | Solid, fits: np.ndarray, label: str) -> Pane:
+    """Make a pane of a shape, framed like the vertices `fits`."""
     solid = shape if isinstance(shape, Solid) else Solid(shape)
     # 15,000 triangles are enough for one of many bodies on the page
-    return Pane([thin_solid(solid, 15_000)], look_around(demo.template, fits, (turn,))[0], label)
+    return Pane([thin_solid(solid, 15_000)], look_around(demo.template, fits, (25,))[0], label)
 
 
-def _in_rows(page: Page, panes: Sequence[Pane], caption: str) -> None:
-    """Add panes in figures of two pairs each."""
-    for i in range(0, len(panes), 4):
-        page.bodies(panes[i:i + 4], caption, 340)
+def _show_scans(demo: Demo) -> Iterator[tuple[str, str, list[Pane]]]:
+    """Yield title, text and panes of the scans, the template with its error, and the worst registration."""
+    chosen = demo.scans[:2] + [one for one in demo.scans if one.subject != "subject"][:2]
+    meshes = {one.name: read_mesh(one.path) for one in chosen}
+    yield ("Scans", "Four range views of each person, as a scanner sees them: 2 mm noise, holes under the arms, "
+           "between the legs and wherever nothing was in sight. Seen from behind, a surface is dark.",
+           [_pane(demo, mesh, mesh.vertices, name) for name, mesh in meshes.items()])
+    template = demo.template
+    error = Solid(template, Heat(surface_error(template, demo.rest), 0, FAR, "distance to the true surface"))
+    yield ("Template", "A careful scan of the subject at rest: its views merged in a volume, its holes filled, "
+           "decimated to well-shaped triangles. All other scans are described by bending it.",
+           [Pane([error], look_around(template, turns=(25,))[0], f"{len(template.faces):,} triangles")])
+    means = {name: 1000 * mean_over_area(off, template) for name, (off, _) in demo.off.items()}
+    worst = max(means, key=means.__getitem__)
+    body = template.with_vertices(demo.prepared.registered.vertices([worst])[0])
+    off = Solid(body, Heat(demo.off[worst][0], 0, FAR, "distance to the truth"), shades={"plain": np.array(CLAY)})
+    yield ("Registration", "The worst scan, and the template on it: first bent by the landmarks, then drawn to the "
+           "scan, at last following it to its noise.",
+           [_pane(demo, read_mesh(demo.folder / "scans" / f"{worst}.ply"), body.vertices, worst),
+            _pane(demo, off, body.vertices, f"{means[worst]:.2f} mm from the truth")])
 
 
-def _scans(demo: Demo, page: Page) -> None:
-    """Add six scans."""
-    page.section("Scans", "Four range views of each person, as a scanner sees them: 2 mm noise, holes under the arms, "
-                 "between the legs and wherever nothing was in sight. Seen from behind, a surface is dark.")
-    chosen = demo.scans[:3] + [s for s in demo.scans if s.subject != "subject"][:3]
-    meshes = [read_mesh(one.path) for one in chosen]
-    page.bodies([_pane(demo, mesh, mesh.vertices, one.name) for one, mesh in zip(chosen, meshes, strict=True)],
-                "six of the scans", 340)
+def _show_model(demo: Demo) -> Iterator[tuple[str, str, list[Pane]]]:
+    """Yield title, text and panes of the parts with their joints, and of the shape components."""
+    yield ("Skeleton", "The parts that move rigidly, found from the registered poses of the subject without being told "
+           "how many, and the joints between them.", parts_panes(demo.template, demo.model.skeleton))
+    yield ("Body shape", "The mean person and the first principal components of the shape deformations, each at two "
+           "standard deviations to either side.", component_panes(demo.model))
 
 
-def _template(demo: Demo, page: Page) -> None:
-    """Add the template and its error."""
-    page.section("Template", "A careful scan of the subject at rest: its views merged in a volume, its holes filled, "
-                 "decimated to well-shaped triangles. All other scans are described by bending it.")
-    mesh = demo.template
-    error = Heat(surface_error(mesh, demo.rest), 0, FAR, "distance to the true surface")
-    page.bodies([Pane([Solid(mesh, smooth=False)], look_around(mesh, turns=(25,))[0], f"{len(mesh.faces):,} triangles"),
-                 Pane([Solid(mesh, error)], look_around(mesh, turns=(25,))[0], "error of the template")])
-
-
-def _registration(demo: Demo, page: Page) -> None:
-    """Add the worst registrations, and a table of them."""
-    page.section("Registration", "The template on the scans: first bent by the landmarks, then drawn to the scan, at "
-                 "last following it to its noise.")
-    registered = demo.prepared.registered
-    meshes = {name: demo.template.with_vertices(vertices)
-              for name, vertices in zip(registered.names, registered.vertices(), strict=True)}
-    means = {name: 1000 * mean_over_area(off, demo.template) for name, (off, _) in demo.off.items()}
-    order = sorted(means, key=lambda name: -means[name])
-    panes = []
-    for name in order[:4]:
-        fits, off = meshes[name].vertices, Heat(demo.off[name][0], 0, FAR, "distance to the truth")
-        panes += [_pane(demo, read_mesh(demo.folder / "scans" / f"{name}.ply"), fits, name),
-                  _pane(demo, Solid(meshes[name], off, shades={"plain": np.array(CLAY)}), fits,
-                        f"{means[name]:.2f} mm from the truth")]
-    _in_rows(page, panes, "the worst: the scan, and the template on it")
-    figures = {one.name: one for one in demo.prepared.figures}
-    worst = 6  # scans in the table of registrations
-    page.table([(name, 1000 * figures[name].distance, means[name], 100 * figures[name].seen)
-                for name in order[:worst]],
-               (f"the worst {min(worst, len(order))} of {len(order)} scans", "to the scan (mm)", "to the truth (mm)",
-                "with data (%)"))
-
-
-def _skeleton(demo: Demo, page: Page) -> None:
-    """Add parts and joints."""
-    page.section("Skeleton", "The parts that move rigidly, found from the registered poses of the subject without "
-                 "being told how many, and the joints between them.")
-    skeleton = demo.model.skeleton
-    page.bodies(parts_panes(demo.template, skeleton), "parts and joints")
-
-
-def _shapes(demo: Demo, page: Page) -> None:
-    """Add the mean body and the first shape components."""
-    page.section("Body shape", "The mean person and the first principal components of the shape deformations, each at "
-                 "two standard deviations to either side.")
-    page.bodies(component_panes(demo.model), "mean and components", 300)
-
-
-def _poses(demo: Demo, page: Page) -> None:
-    """Add the held-out poses, each beside the truth."""
-    page.section("Poses that were never scanned", "The model in held-out poses, coloured by the distance of "
-                 "corresponding points to the truth.")
-    panes = []
-    for truth in demo.held_out:
-        wanted = demo.truth_map.vertices(truth)
-        fitted = demo.fit_pose(wanted)
-        error = distance(fitted, wanted)
-        error_shade = Heat(error, 0, 3 * FAR, "distance of corresponding points")
-        panes += [_pane(demo, truth.mesh, fitted, "truth"),
-                  _pane(demo, Solid(demo.template.with_vertices(fitted), error_shade), fitted,
-                        f"model, {1000 * mean_over_area(error, demo.template):.1f} mm")]
-    _in_rows(page, panes, "the truth, and the model beside it")
-
-
-def _completion(demo: Demo, page: Page, to: Path) -> None:
-    """Add the half view, the completed body, and its error."""
-    page.section("Completion", "One camera saw the person from one side, in a pose that is in no training scan. Blue "
-                 "was measured, yellow was filled in by the model.")
+def _show_unseen(demo: Demo) -> Iterator[tuple[str, str, list[Pane]]]:
+    """Yield title, text and panes of a held-out pose, the completed half view, and the walk."""
+    wanted = demo.true_places(demo.held_out[0])
+    fitted = demo.fit_pose(wanted)
+    error = Heat(distance(fitted, wanted), 0, 3 * FAR, "distance of corresponding points")
+    yield ("Poses that were never scanned", "A held-out pose, and the model in it, coloured by its error.",
+           [_pane(demo, demo.held_out[0].mesh, fitted, "truth"),
+            _pane(demo, Solid(demo.template.with_vertices(fitted), error), fitted, "model")])
     half, marks, truth = demo.half_scan
     done = demo.completion
-    image = picture_completion(half, done, demo.template)
-    save_png(to / "completed" / "completion.png", image)
-    error = distance(done.completed.vertices, demo.truth_map.vertices(truth))
     names, vertices, points = match_landmarks(demo.template_landmarks, marks)
     scan, whole = completion_panes(half, done, demo.template, landmarks=(vertices, points),
                                    names=dict(zip(vertices.tolist(), names, strict=True)))
-    off = Solid(done.completed, Heat(error, 0, 3 * FAR, "distance of corresponding points"), name="error")
-    page.bodies([scan, whole, Pane([off], whole.camera, "how far it is from the truth")],
-                f"{len(marks)} landmarks and the scan, what became of it, and its error", HEIGHT)
-
-
-def _animation(demo: Demo, page: Page, to: Path) -> None:
-    """Add the walk with its markers, and a chart of their distances."""
-    sequence, _, _ = demo.walk
-    motion, subject = demo.motion, demo.subject
-    page.section("Animation", f"{len(sequence.labels)} markers of a walk, 3% of them missing at any time, and the body "
-                 "that follows them.")
-    write_glb(to / "animation" / "walk.glb", motion, subject)
-    page.bodies([pane_with_dots(motion, subject, sequence.positions, "measured markers", sequence.labels)],
-                "the walk with the measured markers", 480)
-    page.chart(chart_residuals(motion), "distance of the markers to where the body puts them")
-    page.text("animation/walk.glb, beside this page, plays in any viewer of glTF.")
+    error = Heat(distance(done.completed.vertices, demo.true_places(truth)), 0, 3 * FAR,
+                 "distance of corresponding points")
+    yield ("Completion", "One camera saw the person from one side, in a pose that is in no training scan. Blue was "
+           "measured, yellow was filled in by the model.",
+           [scan, whole, Pane([Solid(done.completed, error, name="error")], whole.camera, "how far it is off")])
+    yield ("Animation", f"{len(demo.walk.labels)} markers of a walk, 3% of them missing at any time, and the body that "
+           "follows them.",
+           [pane_with_dots(demo.motion, demo.subject, demo.walk.positions, "measured markers", demo.walk.labels)])

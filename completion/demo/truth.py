@@ -1,34 +1,12 @@
 """Errors of the results of the chain against the ground truth of the built-in people."""
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from scanprep.geometry.mesh import Mesh
-from scanprep.geometry.surface import Surface, SurfacePoints
+from scanprep.geometry.surface import Surface
 from scanprep.skeleton.tree import Skeleton
 from scanprep.synthetic.data_set import GroundTruth
-
-
-@dataclass(frozen=True, eq=False)
-class TruthMap:
-    """Where each vertex of the template truly lies on any person: all people share one triangulation."""
-
-    template: Mesh
-    places: SurfacePoints  # the true surface points nearest to the template's vertices
-    part_of_face: np.ndarray  # (F,) int: true part under each triangle of the template
-
-    @staticmethod
-    def of(template: Mesh, rest: GroundTruth) -> TruthMap:
-        """Build the map from the truth of the scan that the template was made of."""
-        surface = Surface(rest.mesh)
-        middle = surface.closest(template.corners.mean(axis=1))
-        return TruthMap(template, surface.closest(template.vertices), rest.part_of_face[middle.faces])
-
-    def vertices(self, truth: GroundTruth) -> np.ndarray:
-        """Compute the true places (N, 3) of the template's vertices, metres."""
-        return self.places.transfer(truth.vertices, truth.faces)
 
 
 def distance(a: np.ndarray, b: np.ndarray) -> np.ndarray:

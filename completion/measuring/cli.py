@@ -15,8 +15,10 @@ from model.measurement.catalogue import CATALOGUE, plain
 from model.measurement.measure import Measurements, measure
 from model.measurement.plausible import implausible_measures
 from model.measurement.survey import ordinal, percentiles
+from model.measurement.tapes import Tapes
 from model.measurement.wanted import WantedBody, body_with_measurements, check_wanted
 from model.people import stature_and_volume
+from model.posing.standing import StandingModel
 from model.shape_statistics import WORDS, Sex, shape_statistics
 from scanprep.arguments import Place, UsageError
 from scanprep.cli import MM, Output, PersonUnit
@@ -32,7 +34,7 @@ from scanprep.words import number_of
 from ..cli import ModelOrNone, read_model
 from .bodies import Body, model_of, read_bodies
 from .page import likely_section, measures_page
-from .template import TapedTemplate, measure_body, tape_template
+from .template import measure_body, tape_template
 
 BodiesArg = Annotated[tuple[Path, ...], Place("[BODY ...]")]
 
@@ -79,8 +81,8 @@ def measure_bodies(bodies: BodiesArg = (), *, output: Output, model: ModelOrNone
     read = read_bodies(bodies, loaded, unit)
     if loaded is None and np.array_equal(read[0].mesh.faces, load_built_in_model().template.faces):
         loaded = load_built_in_model()
-    taped = tape_template(landmarks, read, loaded)
-    measured, tapes = measure_all(read, taped), taped.tapes
+    tapes, standing_model = tape_template(landmarks, read, loaded)
+    measured = measure_all(read, tapes, standing_model)
     standing, names = [one.body for one in measured], [body.name for body in read]
     write_measures(output, names, measured, sex)
     measures_page(names, standing, measured, tapes, sex).write(output.with_suffix(".html"))
@@ -88,12 +90,12 @@ def measure_bodies(bodies: BodiesArg = (), *, output: Output, model: ModelOrNone
                    judgement=judge_bodies(names, measured, [tapes.template.with_vertices(body) for body in standing]))
 
 
-def measure_all(bodies: Sequence[Body], template: TapedTemplate) -> list[Measurements]:
+def measure_all(bodies: Sequence[Body], tapes: Tapes, standing: StandingModel | None) -> list[Measurements]:
     """Measure bodies; each with `Measurements.body` as it was measured."""
     measured = list[Measurements]()
     with bar("measuring") as progress:
         for body in bodies:
-            measured.append(measure_body(body, template))
+            measured.append(measure_body(body, tapes, standing))
             progress(len(measured), len(bodies))
     return measured
 
@@ -183,7 +185,7 @@ def _make_body(to: Sequence[str], output: Path, model: BodyModel, name: str, lan
     """Make the most probable body with given measurements: its mesh, betas and page."""
     wanted = check_wanted(read_measurements(to))
     shape_statistics(model, sex)              # raises at once for a sex that the model does not know
-    tapes = tape_template(landmarks, [], model).tapes
+    tapes, _ = tape_template(landmarks, [], model)
     made = body_with_measurements(model, tapes, wanted, sex)
     write_mesh(output, model.template.with_vertices(made.vertices))
     betas = output.with_name(f"{output.stem}.betas.json")

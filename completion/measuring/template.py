@@ -3,7 +3,6 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -31,16 +30,9 @@ from scanprep.words import number_of
 from .bodies import Body
 
 
-@dataclass(frozen=True, eq=False)
-class TapedTemplate:
-    """The tapes of a template, and what brings its bodies into the pose in which the tapes were found, if anything."""
-
-    tapes: Tapes
-    standing: StandingModel | None
-
-
-def tape_template(file: Path | None, bodies: Sequence[Body], model: BodyModel | None) -> TapedTemplate:
-    """Find the tapes of bodies on their template, and how the bodies come to stand as it does.
+def tape_template(file: Path | None, bodies: Sequence[Body], model: BodyModel | None
+                  ) -> tuple[Tapes, StandingModel | None]:
+    """Find the tapes of bodies on their template, and what brings the bodies into its pose, if anything.
 
     With a model, that is its template. Otherwise the built-in people are laid on the template where it lacks landmarks,
     or where anybody does not stand; the tapes are then found on it as it stands.
@@ -75,28 +67,28 @@ def tape_template(file: Path | None, bodies: Sequence[Body], model: BodyModel | 
                          "template, and there are none, nor do the built-in people come to lie on it; name a file of "
                          "them with --landmarks (scape pick makes one), or a model that keeps them with -m")
     if model is not None:
-        return TapedTemplate(find_tapes(template, known), StandingModel(model, template))
+        return find_tapes(template, known), StandingModel(model, template)
     if people is None:
         tapes = find_tapes(template, known)
         bent = find_bent_limb(tapes)
         if bent is None and all(stands(body.mesh.vertices, tapes) for body in bodies):
-            return TapedTemplate(tapes, None)
+            return tapes, None
         people = lay_people(template)
         if people is None and bent is not None:
             raise ValueError(f"{bodies[0].path}: it is the template of all bodies, as no model is named, and does not "
                              f"stand upright: {bent}; name one that stands first, or the model with -m")
         if people is None:
-            return TapedTemplate(tapes, None)
+            return tapes, None
     upright = template.with_vertices(people.stand(template.vertices).vertices)
-    return TapedTemplate(find_tapes(upright, known), people)
+    return find_tapes(upright, known), people
 
 
-def measure_body(body: Body, template: TapedTemplate) -> Measurements:
+def measure_body(body: Body, tapes: Tapes, standing: StandingModel | None) -> Measurements:
     """Measure one body; its `Measurements.body` is the body as it was measured."""
-    vertices, tapes, error = body.mesh.vertices, template.tapes, body.expected_error
-    if body.betas or template.standing is None:
+    vertices, error = body.mesh.vertices, body.expected_error
+    if body.betas or standing is None:
         return measure(vertices, tapes, tapes.axes if body.betas else None, error)
-    return measure_person(vertices, tapes, template.standing, tapes.axes, error)
+    return measure_person(vertices, tapes, standing, tapes.axes, error)
 
 
 def collect_landmarks(file: Path | None, bodies: Sequence[Body], model: BodyModel | None

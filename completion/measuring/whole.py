@@ -51,4 +51,4 @@ def measure_completion(whole: Completion, model: BodyModel | None = None) -> Mea
     if model is not None and not np.array_equal(whole.completed.faces, model.template.faces):
         raise ValueError(f"model: expected the one of this body ({whole.completed}), got another ({model.template})")
     body = Body("body", whole.completed, Path("body in memory"), completion_error(whole))
-    return measure_body(body, tape_template(None, [body], model))
+    return measure_body(body, *tape_template(None, [body], model))

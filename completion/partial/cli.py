@@ -19,7 +19,6 @@ from scanprep.pipeline.scans import find_scans
 from scanprep.ranges import Axis, direction_of
 
 from ..cli import ModelOrNone, body_of, marks_of_template, read_model
-from .colors import ColorConfig
 from .folder import FolderCall
 from .settings import CompletionConfig
 from .work import CompletionInputs, CompletionTask
@@ -51,7 +50,7 @@ def complete_scan(scans: ScansArg = (), *, output: Output, model: ModelOrNone = 
         subject: Whose body it is: "template" for the one the model's poses were learned from, betas in JSON or .npz,
             or a mesh in the model's triangles. Without it the shape is found too.
         template_landmarks: Where these landmarks are on the model's template; else those kept in the model.
-        mask: Which points are clothing or hair: .npy, .json or .txt of booleans or of the numbers of points, or a
+        mask: Which points are clothing or hair: .npy or .json of booleans or of the numbers of points, or a
             mesh or cloud in which they are painted in a colour. One file, or one for each view; for a folder of
             scans, the folder of such files. Without it, what is 16 mm and more off skin is found, and listed in
             mask.json, to be corrected; a file without points says that all is skin.
@@ -83,8 +82,7 @@ def complete_scan(scans: ScansArg = (), *, output: Output, model: ModelOrNone = 
     inputs = CompletionInputs(scans, landmarks or landmarks_beside(scans[0]), mask)
     # names of landmarks must be known on the template only if there are any
     marks = {} if inputs.landmarks is None else marks_of_template(loaded, template_landmarks, name)
-    work = CompletionTask(body_of(loaded, subject, unit), name, marks, config, unit,
-                          ColorConfig(fill=config.fill_colors))
+    work = CompletionTask(body_of(loaded, subject, unit), name, marks, config, unit)
     if inputs.landmarks is None:
         warnings.warn("no landmarks; the search starts from typical poses, look at report.html for limbs mixed up",
                       stacklevel=2)

@@ -2,7 +2,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -14,23 +13,8 @@ from scanprep.geometry.files import PointCloud
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.surface import Surface
 from scanprep.pictures.textures import Texture
-from scanprep.ranges import Positive, Settings
 
-
-@dataclass(frozen=True)
-class ColorConfig(Settings):
-    """Settings of `carry_colors`.
-
-    Attributes
-    ----------
-    reach : float, metres
-        Largest distance of the scan from a vertex that takes its colour.
-    fill : bool
-        Spread colours smoothly over what was not seen, which is grey otherwise.
-    """
-
-    reach: Positive = 0.02
-    fill: bool = False
+REACH = 0.02                         # metres: what is farther from the scan takes no colour: it may be another limb
 
 
 class ColoredView:
@@ -51,7 +35,7 @@ class ColoredView:
         self.rim = cKDTree(rim) if len(rim) and texture is None else None
         self.normals = prepare_scan(view).normals if self.surface is None else None
 
-    def look(self, places: np.ndarray, normals: np.ndarray, config: ColorConfig) -> tuple[np.ndarray, np.ndarray]:
+    def look(self, places: np.ndarray, normals: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return colours (n, 3) at places (n, 3) with normals (n, 3), and weights (n,), 0 where no surface is near."""
         if self.surface is not None:
             # a mesh: colours of the closest triangle, from its texture or its corners
@@ -72,7 +56,7 @@ class ColoredView:
             colors = np.einsum("nk,nkd->nd", share / share.sum(axis=1, keepdims=True), self.colors[near])
         cosine = np.einsum("nd,nd->n", facing, normals)
         # 0.5: normals of scan and body differ by less than 60 degrees
-        weight = ((far < config.reach) & (cosine > 0.5)).astype(float)
+        weight = ((far < REACH) & (cosine > 0.5)).astype(float)
         # oblique views have less weight: cosine squared, at least 0.02 squared
         if self.camera is not None:
             to = self.camera - places
@@ -84,9 +68,8 @@ class ColoredView:
         return colors, weight
 
 
-def carry_colors(body: Mesh, seen: np.ndarray, scan: View | Sequence[View], config: ColorConfig | None = None,
-                 viewpoint: object = None, metres: float = 1.0, textures: Sequence[Texture | None] = ()
-                 ) -> np.ndarray:
+def carry_colors(body: Mesh, seen: np.ndarray, scan: View | Sequence[View], fill: bool = False,
+                 viewpoint: object = None, metres: float = 1.0, textures: Sequence[Texture | None] = ()) -> np.ndarray:
     """Compute colours (N, 3) in [0, 1] of a completed body.
 
     Parameters
@@ -97,8 +80,8 @@ def carry_colors(body: Mesh, seen: np.ndarray, scan: View | Sequence[View], conf
         Observed vertices; only these take a colour from the scan.
     scan : Mesh or PointCloud with colours, or a sequence of these
         As given to `complete`; views without colours are left out.
-    config : ColorConfig, optional
-        Settings.
+    fill : bool
+        Spread the colours smoothly over what was not seen.
     viewpoint : (3,) float, or one for each view, optional
         Position of the cameras; estimated from the normals when not given. Views that looked at a right angle weigh
         most.
@@ -110,22 +93,20 @@ def carry_colors(body: Mesh, seen: np.ndarray, scan: View | Sequence[View], conf
     Returns
     -------
     (N, 3) float in [0, 1]
-        Grey, or spread smoothly with `config.fill`, where nothing was seen.
+        Grey, or spread smoothly with `fill`, where nothing was seen.
 
     Raises
     ------
     ValueError
         No view has colours.
     """
-    config = config or ColorConfig()
-    colors, weight = blend(views_with_colors(scan, viewpoint, metres, textures), body.vertices, body.vertex_normals,
-                           config)
+    colors, weight = blend(views_with_colors(scan, viewpoint, metres, textures), body.vertices, body.vertex_normals)
     near = body.vertex_adjacency
     closed = seen | (near @ seen.astype(float) > 0.5 * near.sum(axis=1))     # close single gaps between seen vertices
     known = closed & (weight > 0)
     # 0.6: grey where nothing was seen
     out = np.where(known[:, None], colors, 0.6)
-    return np.clip(sparse.harmonic(near, out, known), 0, 1) if config.fill and known.any() else out
+    return np.clip(sparse.harmonic(near, out, known), 0, 1) if fill and known.any() else out
 
 
 def views_with_colors(scan: View | Sequence[View], viewpoint: object = None, metres: float = 1.0,
@@ -146,12 +127,11 @@ def views_with_colors(scan: View | Sequence[View], viewpoint: object = None, met
     return colored
 
 
-def blend(views: Sequence[ColoredView], places: np.ndarray, normals: np.ndarray, config: ColorConfig
-          ) -> tuple[np.ndarray, np.ndarray]:
+def blend(views: Sequence[ColoredView], places: np.ndarray, normals: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Compute the weighted mean colour (n, 3) of the views at places (n, 3), and the sum (n,) of the weights."""
     total, weight = np.zeros_like(places), np.zeros(len(places))
     for view in views:
-        colors, counts = view.look(places, normals, config)
+        colors, counts = view.look(places, normals)
         total += counts[:, None] * colors
         weight += counts
     return total / np.maximum(weight, 1e-12)[:, None], weight

@@ -17,7 +17,6 @@ from scanprep.geometry.files import name_of
 from scanprep.pipeline.scans import find_scans
 
 from ..cli import body_of, marks_of_template, read_model
-from .colors import ColorConfig
 from .settings import CompletionConfig
 from .work import EXPLAINED, MEANS, CompletionInputs, CompletionTask
 
@@ -50,7 +49,7 @@ class FolderCall:
         loaded, name = read_model(self.model)
         marks = marks_of_template(loaded, self.template_landmarks, name, wanted)
         return loaded, CompletionTask(body_of(loaded, self.subject, self.unit), name, marks, self.config, self.unit,
-                                      ColorConfig(fill=self.config.fill_colors), f"scape complete {self.scans}")
+                                      f"scape complete {self.scans}")
 
     def carry_out(self, space: Workspace, workers: Workers) -> Outcome:
         """Complete the scans of the folder."""

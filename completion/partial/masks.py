@@ -1,7 +1,6 @@
 """Masks: files that mark points of a scan as clothing or hair."""
 from __future__ import annotations
 
-import re
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -19,9 +18,9 @@ def read_mask(path: str | Path, points: np.ndarray, unit: str | None = None) -> 
     Parameters
     ----------
     path : path
-        `.npy`, `.json` or `.txt` with one true, false, 1 or 0 for each point, or with the numbers of the marked
-        points. Or a mesh or point cloud (PLY, PCD, OBJ, GLB) of the scan in which marked points have a colour that is
-        not grey: paint clothing in a colour over white, in MeshLab or Blender.
+        `.npy` or `.json` with one true, false, 1 or 0 for each point, or with the numbers of the marked points. Or a
+        mesh or point cloud (PLY, PCD, OBJ, GLB) of the scan in which marked points have a colour that is not grey:
+        paint clothing in a colour over white, in MeshLab or Blender.
     points : (n, 3) float, metres
         Of the scan, one view after the other.
     unit : 'm', 'mm', 'cm' or 'in', optional
@@ -35,7 +34,7 @@ def read_mask(path: str | Path, points: np.ndarray, unit: str | None = None) -> 
     Raises
     ------
     ValueError
-        A file that is missing or holds something else; the message names the file and the line or element.
+        A file that is missing or holds something else; the message names the file and the element.
     """
     path = Path(path)
     ending = path.suffix.lower()
@@ -46,37 +45,20 @@ def read_mask(path: str | Path, points: np.ndarray, unit: str | None = None) -> 
         if not isinstance(found, list):
             raise ValueError(f"{path}: expected a list of booleans or of numbers of points, "
                              f"found {type(found).__name__}")
-        return _read_marked(path, _plain(path, found, "element"), len(points))
-    if ending == ".txt":
-        return _read_marked(path, _words(path), len(points))
+        return _read_marked(path, _plain(path, found), len(points))
     return _find_painted(path, points, unit)
 
 
-def _plain(path: Path, values: Sequence[Any], what: str) -> np.ndarray:
+def _plain(path: Path, values: Sequence[Any]) -> np.ndarray:
     """Convert booleans, or whole numbers, to an array of one type."""
     if values and all(isinstance(value, bool) for value in values):
         return np.array(values, dtype=bool)
     for i, value in enumerate(values):
         if isinstance(value, bool) or not isinstance(value, int):
-            raise ValueError(f"{path}: {what} {i}: expected the number of a point, or true or false for every one, "
+            raise ValueError(f"{path}: element {i}: expected the number of a point, or true or false for every one, "
                              f"found {value!r}")
     with storage.taking_apart(path, "numbers of points"):
         return np.array(values, dtype=np.int64)
-
-
-def _words(path: Path) -> np.ndarray:
-    """Read the words of a text file as booleans or numbers; what follows a # is a remark."""
-    with storage.taking_apart(path, "text"):
-        lines = storage.read_bytes(path, "text").decode("utf-8-sig").splitlines()
-    known: dict[str, bool] = {"true": True, "false": False}
-    values: list[bool | int] = []
-    for number, line in enumerate(lines, 1):
-        for word in line.split("#", 1)[0].replace(",", " ").split():
-            if word.lower() not in known and not re.fullmatch("[0-9]{1,18}", word):
-                raise ValueError(f"{path}: line {number}: expected numbers of points, or true and false, "
-                                 f"found {word[:40]!r}")
-            values.append(known[word.lower()] if word.lower() in known else int(word))
-    return _plain(path, values, "word")
 
 
 def _read_marked(path: Path, values: np.ndarray, count: int) -> np.ndarray:

@@ -28,7 +28,7 @@ from scanprep.pictures.textures import Texture, bake_body_texture, read_texture,
 from scanprep.registration.ground import soles_row
 
 from .clicked_markers import extra_markers, write_clicked_markers
-from .colors import ColorConfig, blend, carry_colors, views_with_colors
+from .colors import blend, carry_colors, views_with_colors
 from .completion import Completion
 from .masks import read_mask
 from .report import completion_page, completion_panes, picture_completion
@@ -50,7 +50,6 @@ class CompletionTask:
     marks: dict[str, int]            # name -> vertex of the template
     config: CompletionConfig
     unit: Unit | None = None         # of the scans and landmarks, where the files cannot tell
-    colors: ColorConfig = field(default_factory=ColorConfig)
     command: str = field(default="", metadata={"digest": False})     # for the report of each scan of a folder
 
     def __call__(self, inputs: CompletionInputs, context: TaskContext) -> list[Metric]:
@@ -122,11 +121,11 @@ def write_results(work: CompletionTask, inputs: CompletionInputs, files: ScanFil
     views, mesh, viewpoint = list(files.views), done.completed, work.config.viewpoint
     # colours of the vertices, and a texture where a view has one
     if files.colored:
-        colors = carry_colors(mesh, done.seen, views, work.colors, viewpoint, done.scale, files.textures)
+        colors = carry_colors(mesh, done.seen, views, work.config.fill_colors, viewpoint, done.scale, files.textures)
         if any(texture is not None for texture in files.textures):
             known = views_with_colors(views, viewpoint, done.scale, files.textures)
             write_textured(output / "completed.glb", bake_body_texture(
-                mesh, lambda places, normals: blend(known, places, normals, work.colors), colors))
+                mesh, lambda places, normals: blend(known, places, normals), colors))
         done = replace(done, completed=Mesh(mesh.vertices, mesh.faces, colors))
     done.save(output)
     metrics = [judgement_row(done.judgement), *completion_figures(work, inputs, done, landmarks, masked)]

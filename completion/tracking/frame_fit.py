@@ -24,10 +24,11 @@ from scanprep.geometry.least_squares import (
 from scanprep.geometry.surface import Surface
 
 from ..smoothing import inertia
-from .settings import TrackConfig
+from .settings import BODY_POINTS, TrackConfig
 
 REACH, FINAL_REACH = 0.1, 0.03       # metres: largest distance of a match in the first round, and from the third on
 SETTLED = 1e-3                       # metres, RMS over the vertices: a round that moves the body less is the last
+ROUNDS = 5                           # most matchings of a frame: two of few vertices, then up to three of all
 ROUGH, VERTICES = 2, 2000            # rounds with few vertices, while the body is still far off; their number
 NEAR, EXPLAINED = 0.05, 0.7          # metres within which a point is explained by the body; least share of the points
 NOTHING = (np.zeros(0, dtype=np.int64), np.zeros((0, 3)))
@@ -48,14 +49,20 @@ class Refined:
     explained: float                 # share of the points within NEAR of the surface
 
 
+def frame_inertia(n_unknowns: int, rate: float) -> np.ndarray:
+    """Compute the information (P,) of the change of velocity per frame."""
+    # standard deviations of accelerations: 60 radians/s² of the joints, 15 m/s² of the place
+    return inertia(n_unknowns, rate, 60.0, 15.0)
+
+
 class FrameFit:
     """A body of known shape, and all that stays the same from frame to frame."""
 
     def __init__(self, body: FixedBody, cloud: ScanPoints, config: TrackConfig, rate: float) -> None:
         self.body, self.config = body, config
         self.scan = scan_fit(body, cloud, *NOTHING, config.scan)
-        self.few = self.scan.some(spread_points(body.template.vertices, VERTICES), config.body_points)
-        self.inertia = inertia(body.n_angles + 3, rate, config.angle_acceleration, config.place_acceleration)
+        self.few = self.scan.some(spread_points(body.template.vertices, VERTICES), BODY_POINTS)
+        self.inertia = frame_inertia(body.n_angles + 3, rate)
 
     def good(self, result: Refined) -> bool:
         """Tell whether a frame is tracked, not lost."""
@@ -66,7 +73,7 @@ class FrameFit:
         # 10: a prediction from two uncertain frames has ten times the variance that acceleration alone gives
         held = 0 * self.inertia if expected is None else self.inertia / 10.0
         goal, n, few = x if expected is None else expected, self.body.n_angles, self.few.on(fit.cloud)
-        for i in range(self.config.rounds):
+        for i in range(ROUNDS):
             # match points and body, first with few vertices
             now, at = few if i < ROUGH else fit, x[None]
             places = now.skin(x).places

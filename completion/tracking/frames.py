@@ -3,7 +3,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -15,6 +15,7 @@ from scanprep.geometry.places import distinct_places
 from scanprep.geometry.sanitise import sanitise
 
 CLOSE, AGREE = 0.05, 0.95            # metres; least share of triangles this close that face like the body; a walk: 0.99
+NORMAL_POINTS = 24                   # neighbours that make one normal, so that 5 mm of noise does not turn it
 
 Frame = Mesh | PointCloud | np.ndarray | Sequence[View] | None
 
@@ -28,15 +29,11 @@ class _Points:
     viewpoint: np.ndarray | None
 
 
-class _Skin(NamedTuple):
-    """The expected body: a search tree of its vertices, and their normals (N, 3)."""
-
-    tree: cKDTree
-    normals: np.ndarray
+# the expected body: a search tree of its vertices, and their normals (N, 3)
+_Skin = tuple[cKDTree, np.ndarray]
 
 
-def prepare_frame(frame: Frame, count: int, neighbours: int, viewpoints: Any = None, expected: Mesh | None = None
-                  ) -> ScanPoints | None:
+def prepare_frame(frame: Frame, count: int, viewpoints: Any = None, expected: Mesh | None = None) -> ScanPoints | None:
     """Return points with normals of a frame, or None when it shows nothing.
 
     Normals are those of planes through many neighbours, so that noise of some millimetres does not turn them. Their
@@ -46,16 +43,16 @@ def prepare_frame(frame: Frame, count: int, neighbours: int, viewpoints: Any = N
     # read the views, each with its camera; views with too few points for a normal are left out
     views = [] if frame is None else [frame] if isinstance(frame, Mesh | PointCloud | np.ndarray) else list(frame)
     cameras = None if viewpoints is None else np.broadcast_to(np.asarray(viewpoints, float), (len(views), 3))
-    skin = None if expected is None else _Skin(cKDTree(expected.vertices), expected.vertex_normals)
+    skin = None if expected is None else (cKDTree(expected.vertices), expected.vertex_normals)
     read = [_read(view, None if cameras is None else cameras[i], i, skin) for i, view in enumerate(views)]
-    read = [view for view in read if len(view.points) > max(NEIGHBOURS, neighbours)]
+    read = [view for view in read if len(view.points) > max(NEIGHBOURS, NORMAL_POINTS)]
     if sum(len(view.points) for view in read) < 60:  # fewer points show nothing
         return None
-    parts = [_orient(view, count // len(read), neighbours, skin) for view in read]
+    parts = [_orient(view, count // len(read), skin) for view in read]
     points, normals = (np.concatenate([part[i] for part in parts]) for i in (0, 1))
     dense = np.concatenate([part[2] for part in parts])
     # borders are those of all views together
-    border, spacing = _borders(points, normals, dense, neighbours)
+    border, spacing = _borders(points, normals, dense)
     number = np.repeat(np.arange(len(parts)), [len(part[0]) for part in parts])
     # the points were spread evenly above
     even = np.full(len(points), spacing**2)
@@ -101,14 +98,14 @@ def _faces_as(skin: _Skin, view: Mesh) -> bool:
     # normals of these triangles
     normals = np.cross(corners[seen, 1] - corners[seen, 0], corners[seen, 2] - corners[seen, 0])
     # compared with the normal at the nearest vertex of the body
-    far, nearest = skin.tree.query(middle[seen], distance_upper_bound=CLOSE)
+    tree, skin_normals = skin
+    far, nearest = tree.query(middle[seen], distance_upper_bound=CLOSE)
     near = np.isfinite(far)
-    agree = np.einsum("fd,fd->f", normals[near], skin.normals[nearest[near]]) > 0
+    agree = np.einsum("fd,fd->f", normals[near], skin_normals[nearest[near]]) > 0
     return 2 * near.sum() > len(seen) and float(agree.mean()) >= AGREE
 
 
-def _orient(view: _Points, count: int, neighbours: int, skin: _Skin | None
-            ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _orient(view: _Points, count: int, skin: _Skin | None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return some points of a view, their normals, and the denser points that gave the normals."""
     denser = 4  # normals come from four times as many points as are matched
     many = spread_points(view.points,
@@ -116,7 +113,7 @@ def _orient(view: _Points, count: int, neighbours: int, skin: _Skin | None
     dense = view.points[many]
     chosen = spread_points(dense, count) if len(dense) > count else np.arange(len(dense))
     # the normal is the direction of least spread of the neighbours
-    _, near = cKDTree(dense).query(dense[chosen], neighbours)
+    _, near = cKDTree(dense).query(dense[chosen], NORMAL_POINTS)
     around = dense[near] - _middles(dense, near)[:, None]
     normals = np.linalg.eigh(np.swapaxes(around, 1, 2) @ around)[1][:, :, 0]
     # a direction outward, for the sign
@@ -125,17 +122,16 @@ def _orient(view: _Points, count: int, neighbours: int, skin: _Skin | None
     elif view.viewpoint is not None:
         outward = view.viewpoint - dense[chosen]
     elif skin is not None:
-        outward = skin.normals[skin.tree.query(dense[chosen], 4)[1]].sum(axis=1)
+        outward = skin[1][skin[0].query(dense[chosen], 4)[1]].sum(axis=1)
     else:
         outward = prepare_scan(dense).normals[chosen]
     normals *= np.where(np.einsum("nd,nd->n", normals, outward) < 0, -1, 1)[:, None]
     return dense[chosen], normals, dense
 
 
-def _borders(points: np.ndarray, normals: np.ndarray, dense: np.ndarray, neighbours: int
-             ) -> tuple[np.ndarray, float]:
+def _borders(points: np.ndarray, normals: np.ndarray, dense: np.ndarray) -> tuple[np.ndarray, float]:
     """Find border points (n,), whose neighbours are all on one side, and the median spacing, metres."""
-    distance, near = cKDTree(dense).query(points, neighbours)
+    distance, near = cKDTree(dense).query(points, NORMAL_POINTS)
     mean = _middles(dense, near) - points
     mean -= np.einsum("nd,nd->n", mean, normals)[:, None] * normals
     # 0.35: at a border the mean of the neighbours is that far off, as a share of their reach

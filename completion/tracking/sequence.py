@@ -18,8 +18,8 @@ from scanprep.threads import one_thread
 
 from ..motion import Motion, Progress
 from ..partial.completion import complete
-from ..smoothing import inertia, predict, smooth_frames
-from .frame_fit import FrameFit, Refined, fit_shared_shape, spread_poses
+from ..smoothing import predict, smooth_frames
+from .frame_fit import FrameFit, Refined, fit_shared_shape, frame_inertia, spread_poses
 from .frames import Frame, frame_views, prepare_frame
 from .settings import TrackConfig
 
@@ -106,7 +106,7 @@ def as_motion(frames: list[TrackedFrame], betas: np.ndarray | None, rate: float,
     x = np.stack([frame.x for frame in frames])
     if config.smoothing:
         # every frame counts as a quadratic about its own optimum, coupled by the accelerations
-        weights = inertia(x.shape[1], rate, config.angle_acceleration, config.place_acceleration)
+        weights = frame_inertia(x.shape[1], rate)
         x = smooth_frames(x, np.stack([frame.gradient for frame in frames]), np.stack([f.precision for f in frames]),
                           weights, config.smoothing)
     residuals = np.array([[frame.residual] for frame in frames])
@@ -142,6 +142,8 @@ def tracking_problem(motion: Motion) -> str | None:
 # Shares of the frames: fewer tracked than FOUND mean nothing, more lost than LOST_FRAMES are a doubt. Six runs of the
 # benchmark and a synthetic person are tracked in all frames, a person enlarged by 1.6 in none, shuffled frames in 0.8.
 FOUND, LOST_FRAMES = 0.1, 0.05
+SEARCH_EVERY = 10                    # one of so many lost frames is searched from scratch: that takes long
+SHAPE_VIEWS = 8                      # frames, those that differ most, from which a shape is found together
 MOMENTUM, LOST = 0.9, 0.5            # share of the velocity that a prediction keeps; the same after a lost frame
 
 
@@ -198,7 +200,7 @@ class BodyTracker:
         config, state = self.config, self.state
         expected = predict(state.past[0], state.past[-1], LOST if state.lost else MOMENTUM) if state.past else None
         # the expected body also tells the sign of normals
-        cloud = prepare_frame(frame, config.frame_points, config.normal_points, self.viewpoints,
+        cloud = prepare_frame(frame, config.frame_points, self.viewpoints,
                               None if expected is None else self._mesh(expected))
         # nothing seen so far
         if expected is None and cloud is None:
@@ -249,7 +251,7 @@ class BodyTracker:
         found = fitter.refine(fit, expected, None if lost else expected)
         if fitter.good(found):
             return found
-        anew = fitter.again(fit, [expected, self.state.past[0]], (lost - 1) % self.config.search_every == 0)
+        anew = fitter.again(fit, [expected, self.state.past[0]], (lost - 1) % SEARCH_EVERY == 0)
         return anew if fit.misfit(anew.x) < fit.misfit(found.x) else found
 
     def _done(self, last: bool = False) -> list[TrackedFrame]:
@@ -271,7 +273,7 @@ class BodyTracker:
         self.state = replace(self.state, shape_known=True)
         if not seen:
             return
-        chosen = spread_poses(np.stack([self._subject_so_far().vertices(x) for x, _ in seen]), self.config.shape_views)
+        chosen = spread_poses(np.stack([self._subject_so_far().vertices(x) for x, _ in seen]), SHAPE_VIEWS)
         betas, _ = fit_shared_shape(self.person, [seen[i][1] for i in chosen], np.stack([seen[i][0] for i in chosen]),
                                     before, self.config)
         self._has_shape(betas)

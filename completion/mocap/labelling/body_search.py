@@ -172,10 +172,10 @@ class BodySearch:
         return placement
 
 
-def robust_weights(places: np.ndarray, targets: np.ndarray, scale: float, sd: float = SD) -> np.ndarray:
+def robust_weights(places: np.ndarray, targets: np.ndarray, scale: float) -> np.ndarray:
     """Compute robust weights (..., L) of matches between places and targets (..., L, 3), NaN without one."""
     squared = ((places - targets)**2).sum(axis=-1)
-    return np.where(np.isnan(squared), 0.0, sd**-2 / (1 + np.nan_to_num(squared) / scale**2)**2)
+    return np.where(np.isnan(squared), 0.0, SD**-2 / (1 + np.nan_to_num(squared) / scale**2)**2)
 
 
 def lay_rigidly(at: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -224,9 +224,10 @@ def label_people(people: Sequence[tuple[BodyModel | Subject, MarkerLayout]], poi
             model = people[k][0]
             if changed and not isinstance(model, Subject):
                 bodies[k] = _find_person(bodies[k], model, at, mine, rate)
-        moving = [body.follow(at, mine, rate) for body, mine in zip(bodies, _of_each(bodies, columns), strict=True)]
-        places = np.concatenate([one.places for one in moving], axis=1)
-        turns = np.concatenate([one.turns for one in moving], axis=1)
+        motions = [body.follow(at, mine, rate) for body, mine in zip(bodies, _of_each(bodies, columns), strict=True)]
+        simulated = [body.simulate(motion) for body, motion in zip(bodies, motions, strict=True)]
+        places = np.concatenate([markers for markers, _ in simulated], axis=1)
+        turns = np.concatenate([rotations for _, rotations in simulated], axis=1)
         # usual offsets of markers from their simulation, in the axes of their parts; new places of displaced markers
         part = np.concatenate([body.part + 1000 * k for k, body in enumerate(bodies)])
         offsets, deviations = mean_offsets(at, columns, places, turns)
@@ -241,10 +242,10 @@ def label_people(people: Sequence[tuple[BodyModel | Subject, MarkerLayout]], poi
     unlabelled[frames, columns[frames, rows]] = False
     labelled = [_sequence(at, mine, body.layout, rate) for body, mine in zip(bodies, _of_each(bodies, columns),
                                                                              strict=True)]
-    return [LabelledMarkers(markers, mine, certain, unlabelled, tracks, one.motion, body.subject, body.layout, body.fit,
+    return [LabelledMarkers(markers, mine, certain, unlabelled, tracks, motion, body.subject, body.layout, body.fit,
                             _judge_person(model, body, markers))
-            for (model, _), body, markers, one, mine, certain
-            in zip(people, bodies, labelled, moving, _of_each(bodies, columns), _of_each(bodies, sure), strict=True)]
+            for (model, _), body, markers, motion, mine, certain
+            in zip(people, bodies, labelled, motions, _of_each(bodies, columns), _of_each(bodies, sure), strict=True)]
 
 
 def _judge_person(model: BodyModel | Subject, person: _Person, markers: MarkerSequence) -> Judgement:
@@ -283,21 +284,15 @@ class _Person:
         subject = model.subject()
         return _Person(subject, layout, layout, mean_person(subject, layout))
 
-    def follow(self, points: np.ndarray, columns: np.ndarray, rate: float) -> _Moving:
+    def follow(self, points: np.ndarray, columns: np.ndarray, rate: float) -> Motion:
         """Compute the motion for the labels in columns (T, L)."""
-        motion = animate(self.subject, _sequence(points, columns, self.layout, rate), self.layout, self.POSES)
+        return animate(self.subject, _sequence(points, columns, self.layout, rate), self.layout, self.POSES)
+
+    def simulate(self, motion: Motion) -> tuple[np.ndarray, np.ndarray]:
+        """Compute the markers (T, L, 3) of a motion, metres, and the rotations (T, L, 3, 3) of their parts."""
         x = self.marked.body.join(motion.poses, motion.trans)
         turns = self.marked.shapes.rotations(np.swapaxes(motion.poses, 0, 1))[self.part]
-        return _Moving(motion, self.marked.positions(x), np.swapaxes(turns, 0, 1))
-
-
-@dataclass(frozen=True, eq=False)
-class _Moving:
-    """A motion, its simulated markers (T, L, 3), metres, and rotations (T, L, 3, 3) of their parts."""
-
-    motion: Motion
-    places: np.ndarray
-    turns: np.ndarray
+        return self.marked.positions(x), np.swapaxes(turns, 0, 1)
 
 
 def _find_person(person: _Person, model: BodyModel, points: np.ndarray, columns: np.ndarray, rate: float) -> _Person:

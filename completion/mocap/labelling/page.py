@@ -1,9 +1,8 @@
-"""Report page of a labelled recording: doubtful labels first, then every marker over time."""
+"""Report page of a labelled recording: its doubtful labels."""
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
@@ -11,15 +10,11 @@ from scanprep.cli import MM
 from scanprep.console import Metric
 from scanprep.pictures.page import Page
 
-from ...motion_pictures import chart_states, frame_panes, frames_apart
+from ...motion_pictures import frame_panes, frames_apart
 from .label import SURE, LabelledMarkers
-from .recording import NAMELESS, LabelledRecording, pack_tracks
+from .recording import LabelledRecording
 
 SHOWN = 30                           # most stretches in the list
-# states of a marker in the chart; where several frames share a pixel, the last one in this list is shown
-STATES = (("#a9c0d4", "labelled"), ("#54789a", "another track"), ("#f4f4f4", "no point"),
-          ("#e39b3b", "doubtful"), ("#a8323e", "hardly believed"), ("#b7a3cc", "point without a label"))
-LABELLED, CHANGED, GAP, DOUBTFUL, UNLIKELY, LOOSE = range(len(STATES))
 
 
 def label_page(recording: LabelledRecording, metrics: Sequence[Metric], table: str, again: str) -> Page:
@@ -43,9 +38,6 @@ def label_page(recording: LabelledRecording, metrics: Sequence[Metric], table: s
         page.bodies(frame_panes(one.motion, one.subject, one.markers.positions, worst),
                     (f"person {k}: " if several else "") + "the body with its labelled points, in the frames that are "
                     "least sure", 320)
-    page.section("Markers over time", "A row for each marker, and below the points that are none, as they are called "
-                 "in the written recording.")
-    page.chart(chart_labels(recording))
     return page.section("Figures").figures(metrics)
 
 
@@ -98,23 +90,3 @@ def _unsure(one: LabelledMarkers) -> list[_Stretch]:
             sure = one.confidence[begin:end, marker]
             found.append(_Stretch(marker, begin, end, begin + int(sure.argmin()), float(sure.mean())))
     return sorted(found, key=lambda each: (each.confidence, each.begin - each.end))
-
-
-def chart_labels(recording: LabelledRecording) -> Any:
-    """Plot the state of every marker over time, and below it the points without a label."""
-    columns, tracks = recording.columns, recording.people[0].tracks
-    number = np.where(columns >= 0, np.take_along_axis(tracks, np.maximum(columns, 0), axis=1), -1)
-    # another track than in the last frame in which the marker had one
-    last = np.maximum.accumulate(np.where(columns >= 0, np.arange(len(columns))[:, None], -1), axis=0)
-    before = np.concatenate([np.full_like(last[:1], -1), last[:-1]])
-    changed = (before >= 0) & (np.take_along_axis(number, np.maximum(before, 0), axis=0) != number)
-    sure = recording.confidence
-    # 0.5: with less confidence another label is more likely
-    state = np.select([columns < 0, sure < 0.5, sure < SURE, changed], [GAP, UNLIKELY, DOUBTFUL, CHANGED], LABELLED)
-    # points without a label, the longest first
-    loose = pack_tracks(tracks, recording.people[0].unlabelled) >= 0
-    # at most 15 rows of these
-    longest = np.argsort(-loose.sum(axis=0), kind="stable")[:15]
-    state = np.concatenate([state, np.where(loose[:, longest], LOOSE, GAP)], axis=1)
-    names = [*recording.names, *(f"{NAMELESS}{i + 1}" for i in longest)]
-    return chart_states(state, names, recording.points.rate, *zip(*STATES, strict=True))

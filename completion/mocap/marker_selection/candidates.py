@@ -76,14 +76,15 @@ def candidate_layout(body: BodyModel | Mesh, base: MarkerLayout, count: int = 11
     return whole.merge(MarkerLayout(tuple(_names(body, skeleton, places)), vertices))
 
 
-def sitting_room(body: Mesh, mirror: SkinMirror, thick: float = 0.022) -> np.ndarray:
+def sitting_room(body: Mesh, mirror: SkinMirror) -> np.ndarray:
     """Return a mask (N,) of vertices where a marker can sit: visible to cameras, flat, on thick limbs, not on soles.
 
-    Lengths are shares of the body's length. The body is at least `thick` below a marker; fingers and ears are not.
+    Lengths are shares of the body's length.
     """
     # shares of the length: 2.5% of either end with a normal along the axis is sole or crown; skin within 6% may hide a
     # marker from cameras
     axis, length = _long_axis(body, mirror)
+    thick = 0.022  # the body is at least so thick below a marker; fingers and ears are not
     along = body.vertices @ axis
     near_end = np.minimum(along - along.min(), along.max() - along) < 0.025 * length
     at_end = near_end & (np.abs(body.vertex_normals @ axis) > 0.5)

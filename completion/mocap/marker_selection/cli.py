@@ -74,10 +74,9 @@ def design(bodies: Path, output: Output, model: ModelOrNone = None, candidates: 
         result = design_markers(loaded, found, among, config, progress, keep=labels, partners=partners, people=people)
     metrics = [Metric("model", name), Metric("bodies", len(found)), Metric("candidates", len(among.labels)),
                Metric("markers", len(result.layout.labels)), Metric("RMSE of all vertices", 1000 * result.rmse, "mm"),
-               *([] if result.full is None else [Metric("the same by full refits", 1000 * result.full, "mm")]),
+               Metric("the same by full refits", 1000 * result.full, "mm"),
                Metric("chosen on the other half of the people", 1000 * result.other_half, "mm"),
-               Metric("with the whole surface seen", 1000 * result.floor, "mm"),
-               *(Metric(f"{c.count} markers by full refits", 1000 * c.full, "mm") for c in result.checks)]
+               Metric("with the whole surface seen", 1000 * result.floor, "mm")]
     output.mkdir(parents=True, exist_ok=True)
     result.layout.save(output / "layout.json")
     # the curves as CSV: name, markers, RMSE in millimetres, and the labels that were added or removed
@@ -116,9 +115,6 @@ def chart_curve(design: MarkerDesign) -> Any:
     for curve in design.curves:
         axes.plot(curve.counts, 1000 * curve.rmse, linewidth=1.4, label=curve.name)
     axes.plot(len(design.layout.labels), 1000 * design.rmse, "o", color="black", markersize=5, label="chosen")
-    if design.checks:
-        axes.plot([c.count for c in design.checks], [1000 * c.full for c in design.checks], "x", color="black",
-                  label="by full refits")
     axes.axhline(1000 * design.floor, color="0.6", linewidth=0.8, linestyle=":", label="whole surface seen")
     axes.set(xlabel="markers", ylabel="RMSE of all vertices (mm)", yscale="log")
     low, high = axes.get_ylim()
@@ -146,7 +142,7 @@ def design_page(design: MarkerDesign, model: BodyModel, candidates: MarkerLayout
     chosen = [label for label in design.layout.labels if label not in keep]
     page.text(f"Chosen: {', '.join(chosen) or 'none'}." + (f" Kept: {', '.join(keep)}." if keep else ""))
     page.section("Error and number of markers").chart(chart_curve(design), "root mean squared distance of all vertices "
-                                                      "of all bodies; linearised, crosses by full refits")
+                                                      "of all bodies; linearised")
     page.section("Figures").figures(metrics)
     page.section("Order", "In which markers, or pairs, came or went, and the error after each.")
     for curve in design.curves:

@@ -12,7 +12,7 @@ from ...motion import Progress
 from ..marker_sets.layout import MarkerLayout
 from .fits import DesignConfig, vertex_errors
 from .greedy import ADD, REMOVE, Groups, MarkerSets, Path, exchange, improve_set, symmetric_groups
-from .linear import LinearBodies, fit_bodies, share_betas
+from .linear import LinearBodies, fit_bodies
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,15 +37,6 @@ class DesignCurve:
 
 
 @dataclass(frozen=True, eq=False)
-class Check:
-    """A marker set, with bodies estimated again without linearisation."""
-
-    count: int
-    linearised: float                # metres, RMSE over all vertices and bodies
-    full: float                      # metres, RMSE by full refits
-
-
-@dataclass(frozen=True, eq=False)
 class MarkerDesign:
     """A marker set, and how it was found.
 
@@ -55,30 +46,26 @@ class MarkerDesign:
         The set, in the order of the candidates.
     rmse : float, metres
         Over all vertices and bodies, estimated from these markers, linearised.
-    full : float, optional, metres
-        RMSE by full refits; None where bodies of a person share betas.
+    full : float, metres
+        RMSE by full refits.
     floor : float, metres
         RMSE of the model fitted to the whole surface of the bodies.
     other_half : float, metres
         RMSE on one half of the bodies of sets chosen on the other half; it is much larger than `rmse` for a set that
         only suits the bodies it was chosen on.
     curves : tuple of DesignCurve
-    checks : tuple of Check
-    exchanged : int
-        Number of exchanged groups after the last step.
     """
 
     layout: MarkerLayout
     rmse: float
-    full: float | None
+    full: float
     floor: float
     other_half: float
     curves: tuple[DesignCurve, ...]
-    checks: tuple[Check, ...]
-    exchanged: int
 
 
 FEWEST = 3                           # least markers; fewer do not determine the place of a body
+EXCHANGES = 1                        # rounds in which each marker of the set is compared with those left out
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,7 +75,6 @@ class Choice:
     paths: dict[str, Path]
     groups: np.ndarray               # (n,) int, of the set
     rmse: float                      # metres
-    exchanged: int
 
 
 def design_markers(model: BodyModel, bodies: np.ndarray, candidates: MarkerLayout, config: DesignConfig | None = None,
@@ -138,7 +124,7 @@ def design_markers(model: BodyModel, bodies: np.ndarray, candidates: MarkerLayou
     >>> model = load_built_in_model()
     >>> among = load_layout("cmu41", model)
     >>> bodies = np.stack([model.vertices(model.pose_mean, betas) for betas in np.eye(2)])
-    >>> quick = DesignConfig(count=6, n_betas=2, surface=100, exchanges=0)
+    >>> quick = DesignConfig(count=6)
     >>> len(design_markers(model, bodies, among, quick).layout.labels)
     6
 
@@ -147,8 +133,6 @@ def design_markers(model: BodyModel, bodies: np.ndarray, candidates: MarkerLayou
     config = config or DesignConfig()
     groups = symmetric_groups(candidates.labels, partners)
     kept = _groups_to_keep(candidates, groups, keep, config)
-    if config.joint and people is None:
-        raise ValueError("people: expected whose body each is, for betas that are common to a person's bodies")
     # fit and linearise, and split the people into halves
     total = 2 * len(bodies) + 2 * len(candidates.labels)
     report_progress = progress or (lambda done, total: None)
@@ -157,10 +141,6 @@ def design_markers(model: BodyModel, bodies: np.ndarray, candidates: MarkerLayou
     if people is not None:
         names = np.unique(people)
         halves = np.isin(people, names[:(len(names) + 1) // 2])
-    if config.joint:
-        assert people is not None, "checked above"
-        linear = share_betas(fits.linear, fits.x, np.asarray(people), fits.markers.n_betas)
-        halves = np.arange(len(linear.rest)) < (len(linear.rest) + 1) // 2
     choice = choose(linear, groups, kept, config,
                     lambda done: report_progress(min(2 * len(bodies) + done, total), total))
 
@@ -172,17 +152,9 @@ def design_markers(model: BodyModel, bodies: np.ndarray, candidates: MarkerLayou
                                                             choose(linear.of(mine), groups, kept, config).groups))))
     report_progress(total, total)
 
-    # errors of the set, and of some sets of the curve, without linearisation
-    def refitted(chosen: list[int]) -> float:
-        return float(np.sqrt(vertex_errors(model, fits.refit(chosen, config), bodies).mean()))
-
-    chosen, full, checks = _members(groups, choice.groups), None, list[Check]()
-    if not config.joint:
-        full = refitted(chosen)
-        for count in config.checks:
-            path = best_path(choice.paths, count)
-            at = path.at(count)
-            checks.append(Check(int(path.counts[at]), float(path.rmse[at]), refitted(_members(groups, path.set(at)))))
+    # error of the set without linearisation
+    chosen = _members(groups, choice.groups)
+    full = float(np.sqrt(vertex_errors(model, fits.refit(chosen, config), bodies).mean()))
     # collect the result, with labels in place of numbers
     labels = candidates.labels
     curves = tuple(DesignCurve(name, tuple(labels[i] for i in _members(groups, path.start)),
@@ -190,8 +162,7 @@ def design_markers(model: BodyModel, bodies: np.ndarray, candidates: MarkerLayou
                    for name, path in choice.paths.items())
     return MarkerDesign(candidates.without([label for i, label in enumerate(labels) if i not in chosen]), choice.rmse,
                         full, float(np.sqrt(fits.linear.rest.mean())),
-                        float(np.sqrt(np.concatenate(other).mean())) if other else float("nan"), curves, tuple(checks),
-                        choice.exchanged)
+                        float(np.sqrt(np.concatenate(other).mean())) if other else float("nan"), curves)
 
 
 def choose(linear: LinearBodies, groups: Groups, kept: np.ndarray, config: DesignConfig,
@@ -213,12 +184,12 @@ def choose(linear: LinearBodies, groups: Groups, kept: np.ndarray, config: Desig
     # the better curve, improved by exchanges
     best = best_path(paths, config.count)
     sets = MarkerSets(linear, groups, best.set(best.at(config.count)))
-    exchanged = exchange(sets, free, config.exchanges)
+    exchange(sets, free, EXCHANGES)
     alone = MarkerSets(linear, groups, np.flatnonzero(kept))
     if alone.count > FEWEST:
         paths["kept, removed"] = improve_set(alone, REMOVE, kept, FEWEST, stops, told)
     chosen = np.flatnonzero(sets.inside)
-    return Choice(paths, chosen, linear.rmse(_members(groups, chosen)), exchanged)
+    return Choice(paths, chosen, linear.rmse(_members(groups, chosen)))
 
 
 def best_path(paths: dict[str, Path], count: int) -> Path:

@@ -33,29 +33,14 @@ class DesignConfig(Settings):
     poses : int
         Number of poses of the model's training set into which `scape layout design` puts each body; 0 keeps the bodies
         as they are.
-    n_betas : int, optional
-        Number of betas that are estimated; all when not given.
-    joint : bool
-        Bodies of a person share betas; else each body is estimated by itself, as in the paper.
     marker_sd : float, metres
         Standard deviation of a marker from its simulated place.
-    surface : int
-        Number of spread vertices that represent the surface while sets are compared, each for those nearest to it.
-    exchanges : int
-        Rounds in which each marker of the set, or pair, is compared with those left out.
-    checks : ints
-        Counts at which the set of the curve is estimated again without linearisation.
     """
 
     count: Annotated[Count, FLAG] = 47
     through: tuple[Count, ...] = ()
     poses: int = 0
-    n_betas: int | None = None
-    joint: bool = False
     marker_sd: Positive = 0.005
-    surface: Count = 1000
-    exchanges: int = 1
-    checks: tuple[Count, ...] = ()
 
 
 class BodyPoints:
@@ -117,7 +102,7 @@ class Prior:
         return Prior(self.precision, self.mean[some])
 
 
-def prior_around(model: BodyModel, x: np.ndarray, shape_weight: float = 1.0) -> Prior:
+def prior_around(model: BodyModel, x: np.ndarray) -> Prior:
     """Build the prior of bodies with place and orientation near those of x (Z, P). [MoSh] Eq. 20, Eq. 21"""
     poses = gaussian_prior(model.pose_mean, model.pose_covariance)
     n, P = len(poses.mean), x.shape[1]
@@ -125,7 +110,7 @@ def prior_around(model: BodyModel, x: np.ndarray, shape_weight: float = 1.0) -> 
     precision[:n, :n] = poses.whitening.T @ poses.whitening
     place = np.r_[:3, n:n + 3]
     precision[place, place] += 1.0                       # standard deviations of a metre and a radian
-    precision[np.arange(n + 3, P), np.arange(n + 3, P)] = shape_weight
+    precision[np.arange(n + 3, P), np.arange(n + 3, P)] = 1.0
     mean = np.zeros_like(x)
     mean[:, :n] = poses.mean
     mean[:, place] = x[:, place]

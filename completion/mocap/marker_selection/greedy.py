@@ -171,14 +171,13 @@ def improve_set(sets: MarkerSets, sign: int, movable: np.ndarray, until: int, th
             report_progress(sets.count)
 
 
-def exchange(sets: MarkerSets, movable: np.ndarray, rounds: int) -> int:
+def exchange(sets: MarkerSets, movable: np.ndarray, rounds: int) -> None:
     """Try to exchange every group of the set, and single ones two at a time, for better ones, in some rounds.
 
-    A pair may be exchanged for two single markers and the other way round. Returned is the number of exchanges.
+    A pair may be exchanged for two single markers and the other way round.
     """
-    done = 0
     for _ in range(rounds):
-        before = done
+        done = 0
         for group in np.flatnonzero(movable & sets.inside):
             if sets.inside[group]:
                 done += _exchange(sets, movable, [int(group)])
@@ -188,9 +187,8 @@ def exchange(sets: MarkerSets, movable: np.ndarray, rounds: int) -> int:
             if sets.inside[group] and len(others):
                 least = others[np.argmin(sets.score_groups(others, REMOVE))]
                 done += _exchange(sets, movable, [int(group), int(least)])
-        if done == before:
+        if not done:
             break
-    return done
 
 
 def _exchange(sets: MarkerSets, movable: np.ndarray, out: list[int]) -> bool:

@@ -2,7 +2,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -18,6 +18,7 @@ from ..marker_sets.layout import MarkerLayout
 from .fits import BodyPoints, DesignConfig, Prior, fit_points, prior_around, rough_poses
 
 FIT_ITERATIONS = 20                  # most steps of the fit to the whole surface, and of a full refit
+SURFACE = 1000                       # vertices that stand for the surface while sets are compared, 5 cm apart on people
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,9 +80,7 @@ class WholeFits:
 def fit_bodies(model: BodyModel, bodies: np.ndarray, candidates: MarkerLayout, config: DesignConfig,
                progress: Progress | None = None) -> WholeFits:
     """Fit the model to every whole body (Z, N, 3), metres, in any poses, and linearise there."""
-    bodies, n_betas = check_marker_bodies(model, bodies), model.n_betas if config.n_betas is None else config.n_betas
-    if not 0 < n_betas <= model.n_betas:
-        raise ValueError(f"n_betas: expected 1..{model.n_betas}, got {n_betas}")
+    bodies, n_betas = check_marker_bodies(model, bodies), model.n_betas
     N, most = len(model.template.vertices), int(np.max(candidates.vertices, initial=0))
     if not candidates.labels or most >= N:
         raise ValueError(f"candidates: expected markers on vertices 0..{N - 1}, got {len(candidates.labels)} markers "
@@ -99,7 +98,7 @@ def fit_bodies(model: BodyModel, bodies: np.ndarray, candidates: MarkerLayout, c
     places = np.einsum("lk,zlkd->zld", shares, bodies[:, ids])
 
     # linearise markers and surface there, in batches of bodies
-    spread = spread_vertices(template, config.surface)
+    spread = spread_vertices(template, SURFACE)
     surface = BodyPoints(model.points(spread, None, n_betas))
     root = np.sqrt(share_of_vertices(template, spread) / len(template))[:, None]
     (Z, P), C = x.shape, markers.count
@@ -128,48 +127,6 @@ def check_marker_bodies(model: BodyModel, bodies: np.ndarray) -> np.ndarray:
     if bodies.ndim != 3 or not len(bodies) or bodies.shape[1:] != wanted or not np.isfinite(bodies).all():
         raise ValueError(f"bodies: expected finite numbers of shape (Z, {wanted[0]}, 3), got shape {bodies.shape}")
     return bodies
-
-
-def share_betas(linear: LinearBodies, x: np.ndarray, people: np.ndarray, n_betas: int) -> LinearBodies:
-    """Combine bodies, linearised around x (Z, P), that share the betas of a person (Z,): one problem for each person.
-
-    Unknowns of a person are pose and place of its bodies in turn, then the betas, as a step from the mean of those of
-    its bodies. The rows of a candidate are those in all bodies.
-    """
-    names, each = np.unique(people, return_counts=True)
-    if len(people) != len(x) or len(set(each.tolist())) > 1:
-        raise ValueError(f"people: expected one of each of {len(x)} bodies, and as many bodies of every person, got "
-                         f"{len(people)} with {each.tolist()}")
-    bodies, F, K = np.argsort(people, kind="stable"), int(each[0]), n_betas
-    Z, P = x.shape
-    n, own = P - K, slice(P - K, P)
-    shift = np.zeros((len(names), F, P))
-    betas = x[bodies][:, own].reshape(len(names), F, K)
-    shift[..., own] = betas.mean(axis=1, keepdims=True) - betas
-    # shift every body to the mean betas of its person, to first order; steps start there
-    at, lead = linear.of(bodies), shift.reshape(Z, P)
-    at = replace(at, gaps=at.gaps - (at.rows @ lead[:, None, :, None])[..., 0],
-                 pull=at.pull - (at.gram @ lead[..., None])[..., 0], rest=at.surface_error(lead),
-                 lean=at.lean - lead @ at.precision)
-    C, r = at.gaps.shape[1:]
-    rows, gaps = np.zeros((len(names), C, F * r, F * n + K)), at.gaps.reshape(len(names), F, C, r)
-    gram, pull = np.zeros((len(names), F * n + K, F * n + K)), np.zeros((len(names), F * n + K))
-    precision, lean = np.zeros(gram.shape[1:]), np.zeros_like(pull)
-    alone = (at.rows.reshape(len(names), F, C, r, P), at.gram.reshape(len(names), F, P, P),
-             at.pull.reshape(len(names), F, P), at.lean.reshape(len(names), F, P))
-    # blocks of the f-th body of every person, and its contributions to the common betas
-    for f in range(F):
-        B, G, p, lean_f = (a[:, f] for a in alone)
-        block = np.r_[f * n:(f + 1) * n, F * n:F * n + K]
-        rows[:, :, f * r:(f + 1) * r, block] = B
-        gram[:, block[:, None], block] += G / F
-        pull[:, block] += p / F
-        lean[:, block[:n]] = lean_f[:, :n]
-        precision[block[:n, None], block[:n]] = linear.precision[:n, :n]
-    precision[F * n:, F * n:] = linear.precision[own, own]
-    lean[:, F * n:] = alone[3][:, 0, own]                            # the same for all bodies, at the same betas
-    return LinearBodies(rows, gaps.transpose(0, 2, 1, 3).reshape(len(names), C, F * r), gram, pull,
-                        at.rest.reshape(len(names), F).mean(axis=1), precision, lean)
 
 
 def example_poses(model: BodyModel, count: int) -> np.ndarray:

@@ -36,8 +36,6 @@ COMMANDS = {
     "list": ("The marker sets that come along.", "completion.mocap.marker_sets.cli:list_layouts"),
     "show": ("A layout on a body: pictures from four sides and a table.",
              "completion.mocap.marker_sets.cli:show_layout"),
-    "find": ("Where the markers of a recording sit, when nobody knows it.",
-             "completion.mocap.labelling.layout_cli:find_in_recording"),
     "transfer": ("A layout on another triangulation, by registration.",
                  "completion.mocap.marker_sets.cli:transfer_to"),
     "design": ("Which markers to put on: the set from which bodies are estimated best.",

@@ -22,14 +22,14 @@ HEIGHT = 1000                        # pixels, so that labels are legible
 FIXED, LOOSE = (0.86, 0.24, 0.20), (0.93, 0.62, 0.12)
 
 
-def picture_layout(body: Mesh, layout: MarkerLayout, height: int | None = None) -> np.ndarray:
+def picture_layout(body: Mesh, layout: MarkerLayout) -> np.ndarray:
     """Render a body with its markers from four sides as (H, W, 3) uint8; visible markers have their label.
 
     Loose markers have another colour.
     """
     from PIL import Image, ImageDraw
 
-    cameras, height, images = look_around(body), height or HEIGHT, []
+    cameras, height, images = look_around(body), HEIGHT, []
     width, size = int(height * max(c.width / c.height for c in cameras)) + 100, font(12)
     points, radius = layout.place(body), 0.0055 * float(np.ptp(body.vertices, axis=0).max())
     labels = [printable(label) for label in layout.labels]
