@@ -8,7 +8,7 @@ from glb_reader import Glb
 from completion.__main__ import main
 from completion.partial.completion import Completion, load_completion
 from model import load_built_in_model, load_model
-from model.resolution.change import ResolutionConfig, change_resolution, resample
+from model.resolution.change import change_resolution, resample
 from scanprep import Mesh, read_mesh, write_mesh
 from scanprep.cli import read_poses
 from scanprep.geometry import rotations
@@ -139,7 +139,7 @@ def test_a_completion_is_read_again(tmp_path):
 
 def test_fewer_triangles_keep_the_eyes(learned):
     model = load_model(learned / "model.npz")
-    coarse = change_resolution(model, resample(model.template, 1500), ResolutionConfig(rounds=0))
+    coarse = change_resolution(model, resample(model.template, 1500), rounds=0)
     whole = coarse.template.attached.mesh(coarse.template)
     assert len(whole.vertices) == 1500 + 2 * EYE + 1 and whole.vertex_component.max() == 3
     assert np.abs(whole.vertices[1500:] - WHOLE.vertices[model.template.attached.others]).max() < 1e-12

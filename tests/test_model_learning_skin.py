@@ -21,7 +21,7 @@ from scanprep.geometry import rotations
 from scanprep.geometry.mesh import Mesh
 from scanprep.skeleton.tree import Skeleton
 
-NARROW = {"width": 0.08, "rounds": 4}
+FEW = {"rounds": 4}
 
 
 @pytest.fixture(scope="module")
@@ -41,14 +41,14 @@ def training(truth):
 
 @pytest.fixture(scope="module")
 def learned(truth, training):
-    config = SkinConfig(components=5, **NARROW)
+    config = SkinConfig(components=5, **FEW)
     return learn_skinning(truth.template, *training, truth.skeleton, config)
 
 
 def test_new_poses_of_the_truth_are_met(truth, training, learned):
     """Data a skinning model made come back, best with the correctives they were made with."""
     bodies = truth.subject().vertices(random_poses(truth, 6, np.random.default_rng(1), 0.4))
-    plain = learn_skinning(truth.template, training[0], None, truth.skeleton, SkinConfig(correctives=False, **NARROW))
+    plain = learn_skinning(truth.template, training[0], None, truth.skeleton, SkinConfig(correctives=False, **FEW))
     linear, none = (np.mean([fit_pose(m.subject(), y).mean for y in bodies]) for m in (learned, plain))
     assert linear < 2.2e-3
     assert linear < 0.6 * none
@@ -70,7 +70,7 @@ def test_weights_and_joints_are_recovered(monkeypatch):
     wide = replace(truth, weights=diffuse_weights(truth.template, truth.skeleton, 0.12))
     assert np.abs(wide.weights - truth.weights).max() > 0.03
     for _ in range(8):
-        wide = _with_weights(wide, poses, bodies, truth.weights > 0, SkinConfig())
+        wide = _with_weights(wide, poses, bodies, truth.weights > 0)
     np.testing.assert_allclose(wide.weights, truth.weights, atol=2e-3)
 
 
@@ -171,7 +171,7 @@ def test_features_are_functions_of_the_kept_directions(correctives):
 
 def test_rigid_motion_of_the_data_changes_nothing_within(truth, training):
     rng = np.random.default_rng(9)
-    bodies, config = training[0][:12], SkinConfig(width=0.08, rounds=1)
+    bodies, config = training[0][:12], SkinConfig(rounds=1)
     R = rotations.exp(rng.normal(size=(12, 3)))
     moved = bodies @ np.swapaxes(R, -1, -2) + rng.normal(size=(12, 1, 3))
     a, b = (learn_skinning(truth.template, y, None, truth.skeleton, config) for y in (bodies, moved))
@@ -180,7 +180,7 @@ def test_rigid_motion_of_the_data_changes_nothing_within(truth, training):
 
 
 def test_same_input_gives_the_same_bytes(truth, training):
-    config = SkinConfig(width=0.08, rounds=1)
+    config = SkinConfig(rounds=1)
     a, b = (learn_skinning(truth.template, training[0][:8], training[1][:4], truth.skeleton, config) for _ in range(2))
     for name in ("rest", "weights", "correctives", "shape_mean", "shape_components", "pose_covariance"):
         np.testing.assert_array_equal(getattr(a, name), getattr(b, name))
@@ -204,7 +204,7 @@ def test_a_body_of_one_part(training):
 def test_progress_runs_to_its_end(truth, training):
     seen = []
     learn_skinning(truth.template, training[0][:5], training[1][:3], truth.skeleton,
-                   SkinConfig(width=0.08, rounds=2), lambda done, total: seen.append((done, total)))
+                   SkinConfig(rounds=2), lambda done, total: seen.append((done, total)))
     assert seen[-1][0] == seen[-1][1] and [d for d, _ in seen] == sorted(d for d, _ in seen)
 
 

@@ -9,7 +9,7 @@ from model import BodyModel, load_model
 from model.cli import group
 from model.features import linear_features
 from model.pose_space import PoseSpace
-from model.resolution.change import ResolutionConfig, change_resolution, resample, resolution_gap, subdivide_at_middles
+from model.resolution.change import change_resolution, resample, resolution_gap, subdivide_at_middles
 from model.resolution.transfer import Piece, gradients_of, transfer_skeleton
 from model.scape import BlendScapeModel, ScapeModel
 from model.shape_space import ShapeSpace
@@ -17,8 +17,6 @@ from scanprep import decimate, write_mesh
 from scanprep.geometry import rotations
 from scanprep.geometry.carrier import mount
 from scanprep.geometry.mesh import Mesh
-
-ROUGH = ResolutionConfig(rounds=0)
 
 
 @pytest.fixture(scope="module")
@@ -45,7 +43,7 @@ def typical(model, count=6, seed=5):
 
 
 def test_the_same_triangles_give_the_same_model(model):
-    same = change_resolution(model, model.template, ROUGH)
+    same = change_resolution(model, model.template, rounds=0)
     pose = typical(model, 1)[0]
     np.testing.assert_allclose(same.vertices(pose), model.vertices(pose), rtol=0, atol=1e-6)
     # S is carried as the shapes that the parts have in the mean pose, which is a little less than all of S
@@ -57,7 +55,7 @@ def test_the_same_triangles_give_the_same_model(model):
 
 def test_the_same_triangles_in_another_order(model):
     order = np.random.default_rng(0).permutation(len(model.template.faces))
-    turned = change_resolution(model, Mesh(model.template.vertices, model.template.faces[order]), ROUGH)
+    turned = change_resolution(model, Mesh(model.template.vertices, model.template.faces[order]), rounds=0)
     np.testing.assert_array_equal(turned.skeleton.part_of_face, model.skeleton.part_of_face[order])
     pose = typical(model, 1)[0]
     np.testing.assert_allclose(turned.vertices(pose), model.vertices(pose), rtol=0, atol=1e-6)
@@ -76,7 +74,7 @@ def test_a_model_deformed_alike_everywhere_stays_exact(model, faces):
         ShapeSpace(np.tile(np.eye(3) + B, (sizes.sum(), 1, 1)), np.tile(B, (1, sizes.sum(), 1, 1)), np.ones(1), 1.0),
         np.zeros((4, 3)), np.zeros((12, 12)))
     template = subdivide_at_middles(model.template) if faces is None else decimate(model.template, faces)
-    carried = change_resolution(alike, template, ROUGH)
+    carried = change_resolution(alike, template, rounds=0)
     centre = skeleton.joints[0]
     for betas, M in ((None, A), ([2.0], (np.eye(3) + 3 * B) @ A)):
         y = carried.vertices(np.zeros((4, 3)), betas)
@@ -93,7 +91,7 @@ def test_finer_and_coarser_mean_the_same_body(model, finer):
 
 
 def test_correction_lowers_what_is_left(model, finer):
-    rough = change_resolution(model, finer.template, ROUGH)
+    rough = change_resolution(model, finer.template, rounds=0)
     for betas in (None, [1.0, -0.5, 1.0]):
         left = [np.mean([apart(model, m, pose, betas)[0] for pose in typical(model)]) for m in (rough, finer)]
         assert left[1] < 0.7 * left[0]
