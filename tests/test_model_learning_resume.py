@@ -224,12 +224,6 @@ def test_a_person_that_changes_while_learning_is_interrupted(bodies, counted):
     assert found == learned(bodies, "fresh.npz")
 
 
-def test_times_tell_what_was_done_before(bodies, searched):
-    for known in (0, 3):
-        learned(bodies, "m.npz", search=True)
-        assert (bodies / "m.npz.report.json").read_text().count("done before") == known
-
-
 @pytest.mark.parametrize("step", ["skeleton", "pose space", "shape components"])
 def test_a_damaged_step_is_made_anew(bodies, searched, counted, step):
     undisturbed, since = learned(bodies, "m.npz", search=True), dict(counted)

@@ -195,7 +195,7 @@ def test_a_model_of_something_else_is_refused_by_name_and_left_out_by_itself(kno
     for i, body in enumerate(known.subject().vertices(poses)):
         write_mesh(tmp_path / "poses" / f"{i:02d}.ply", known.template.with_vertices(body))
     known.skeleton.save(tmp_path / "skeleton.json")
-    words = ["learn", "--poses", str(tmp_path / "poses"), "--template", str(tmp_path / "poses" / "00.ply"),
+    words = ["learn", "--poses", str(tmp_path / "poses"),
              "--skeleton", str(tmp_path / "skeleton.json"), "-o", str(tmp_path / "m.npz")]
     assert main([*words, "--prior", "people"]) == 1
     assert "--prior people: the model does not come to lie" in capsys.readouterr().err

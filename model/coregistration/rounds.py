@@ -26,6 +26,7 @@ from .single import Landmarks, ModelRegistration, register_with_model
 
 Progress = Callable[[int, int], None]
 Scan = Mesh | np.ndarray
+SETTLED = 0.0007                     # share of √area, 1 mm on a man: a round that moves the mean vertex less ends it
 Lessons = tuple[np.ndarray, np.ndarray | None]       # poses (M, N, 3) of the template's person, shapes (S, N, 3)
 
 
@@ -182,7 +183,7 @@ def coregister(model: BodyModel, scans: Sequence[Scan], landmarks: Sequence[Land
     own, history = _own(subjects, n), list[Round]()
     good, registrations, failures = np.zeros(n, dtype=bool), list[ModelRegistration | None](), dict[str, str]()
     with workspace_or_temporary(space) as kept:
-        while len(history) < config.rounds and not _has_settled(history, model, config):
+        while len(history) < config.rounds and not _has_settled(history, model):
             # 1. register all scans with the model of this round
             turn, last = len(history), registrations
             ready = [OneScan(scans[i], marks[i], before[i], bool(own[i])) for i in range(n)]
@@ -193,7 +194,7 @@ def coregister(model: BodyModel, scans: Sequence[Scan], landmarks: Sequence[Land
             history.append(_summary(registrations, good, last))
             model = _taught(kept, model, lessons, config, turn)
             before = [start if r is None else r.mesh.vertices for r, start in zip(registrations, before, strict=True)]
-    return Coregistration(tuple(registrations), good, model, len(history), _has_settled(history, model, config),
+    return Coregistration(tuple(registrations), good, model, len(history), _has_settled(history, model),
                           tuple(history), failures)
 
 
@@ -274,9 +275,9 @@ def _summary(registrations: Sequence[ModelRegistration | None], good: np.ndarray
                  float(np.median([r.apart for r in there])), float(np.mean(moved)) if moved else np.nan)
 
 
-def _has_settled(history: Sequence[Round], model: BodyModel, config: CoregistrationConfig) -> bool:
+def _has_settled(history: Sequence[Round], model: BodyModel) -> bool:
     size = float(np.sqrt(model.template.face_areas.sum()))
-    return bool(history and history[-1].change <= config.tolerance * size)
+    return bool(history and history[-1].change <= SETTLED * size)
 
 
 def coregistration_doubts(done: Coregistration, names: Sequence[str]) -> list[str]:
