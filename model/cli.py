@@ -27,7 +27,7 @@ COMMANDS = {
     "import": ("A body model of the SMPL family's layout, MHR or SOMA-X as ours.", "model.cli:import_file"),
     "mesh": ("The mesh of one pose and shape.", "model.posing.cli:mesh"),
     "sample": ("Random bodies: meshes, a sheet of pictures, betas and poses.", "model.evaluation.cli:sample"),
-    "evaluate": ("Errors on held-out bodies, with a page of curves and pictures.", "model.evaluation.cli:evaluate"),
+    "evaluate": ("Errors on held-out bodies, with a page of pictures.", "model.evaluation.cli:evaluate"),
     "resample": ("The model with fewer or more triangles.", "model.resolution.cli:resample_model"),
     "coregister": ("Scans registered with a model as prior, and the model learned again.",
                    "model.coregistration.cli:coregister_scans"),
