@@ -1,6 +1,5 @@
 """The model of the built-in people: that of the population, in the wheel, made by its recipe."""
 import json
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -103,13 +102,6 @@ def test_it_is_named_people_wherever_a_model_is_asked_for(tmp_path, monkeypatch)
     Path("people").write_bytes(b"a file of mine")
     with pytest.raises(storage.StorageError, match="people: "):
         load_model("people")
-
-
-def test_a_file_of_the_old_people_works_and_is_told_to_be_old(tmp_path):
-    path, old = tmp_path / "old.npz", replace(load_built_in_model(), info={"name": "synthetic people"})
-    old.save(path)
-    with pytest.warns(UserWarning, match=r"old\.npz: .*earlier version.*made up.*-m people"):
-        assert load_model(path).n_betas == 30
 
 
 @pytest.mark.parametrize(("named", "known"), [

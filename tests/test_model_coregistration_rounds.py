@@ -49,7 +49,7 @@ def test_the_person_with_most_scans_teaches_poses_and_others_shapes(monkeypatch)
     monkeypatch.setattr(rounds_module, "register_with_model", ready)
     done = coregister(worm, bodies, None, replace(COARSE, rounds=1), subjects=who)
     assert done.model.info["poses"] == 1 + 3 and done.model.info["shapes"] == 3      # the template; not the one failed
-    assert done.good.tolist() == [True] * 6 + [False, True] and done.history[0].failed == 1
+    assert done.good.tolist() == [True] * 6 + [False, True] and done.failed[0] == 1
     assert done.model.n_betas == 2
 
 
@@ -82,8 +82,8 @@ def test_rounds_mend_what_failed_and_better_the_model(story, body):
     # those that failed end at 5.6 to 6.9 mm by the noise of their scans (four draws), and once at 126 in earlier code
     assert (after[:3] < 3).all() and (after[3:] < 8).all()
     assert after[:3].mean() < before[:3].mean() + 0.5
-    assert done.rounds == 2 and done.history[0].failed <= 1 and done.history[1].failed == 0     # 2 had failed without
-    assert np.isnan(done.history[0].change) and done.history[1].change < 3e-3
+    assert done.rounds == 2 and done.failed[0] <= 1 and done.failed[1] == 0     # 2 had failed without
+    assert np.isnan(done.changes[0]) and done.changes[1] < 3e-3
     assert done.model.info["poses"] == 6 and not done.failures
 
 
@@ -179,7 +179,7 @@ def test_a_scan_that_cannot_be_registered_stops_no_other(story):
     done = coregister(first, spoilt, None, replace(QUICK, rounds=1), starts, names=["a", "b", "c"])
     assert list(done.failures) == ["c"] and "c" in done.failures["c"]
     assert done.good.tolist() == [True, True, False] and done.registrations[2] is None
-    assert done.history[0].failed == 1
+    assert done.failed[0] == 1
     with pytest.raises(ValueError, match=r"only 0 of 2.*scan 0: "):
         coregister(first, spoilt[2:] * 2, None, replace(QUICK, rounds=1))
 

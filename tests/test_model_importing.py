@@ -147,7 +147,7 @@ def test_people_are_fitted_and_the_resolution_changes(both):
 
 def test_our_own_export_comes_back(tmp_path):
     worm = skinned_worm(True)
-    arrays = write_body_npz(tmp_path / "body.npz", worm, worm.weights)
+    arrays = write_body_npz(tmp_path / "body.npz", worm)
     back = import_model(tmp_path / "body.npz")
     assert back.skeleton.names == worm.skeleton.names and back.n_betas == 3
     pose, betas = np.random.default_rng(0).normal(0, 0.4, (4, 3)), np.array([1.0, -0.5, 2.0])

@@ -84,7 +84,7 @@ def counted(monkeypatch):
 @pytest.fixture
 def searched(monkeypatch):
     """A search for a skeleton that takes no time, for words without --skeleton."""
-    chosen = ChosenSkeleton(worm_model().skeleton, {4: 0.001}, False, np.nan)
+    chosen = ChosenSkeleton(worm_model().skeleton, {4: 0.001}, False)
     monkeypatch.setattr(body, "choose_skeleton", lambda *given: chosen)
 
 

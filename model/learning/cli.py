@@ -146,16 +146,11 @@ def _read_people(shapes: Path, body: Mesh, unit: Unit | None) -> tuple[np.ndarra
 
 
 def _about_choice(choice: ChosenSkeleton | None) -> list[Metric]:
-    """Say how many parts predict left-out poses as well, and what tying left and right costs or gains."""
+    """Say which other numbers of parts predict left-out poses as well."""
     if choice is None:
         return []
     fewest, most = choice.as_good
-    rows = [] if fewest == most else [Metric("parts that predict left-out poses as well", f"{fewest} to {most}")]
-    if np.isfinite(choice.other_error):
-        ours, others = ("alike", "free") if choice.tied else ("free", "alike")
-        rows.append(Metric("left and right", f"{ours}: left-out poses {1000 * choice.error:.3g} mm off, {others} "
-                           f"{1000 * choice.other_error:.3g}"))
-    return rows
+    return [] if fewest == most else [Metric("parts that predict left-out poses as well", f"{fewest} to {most}")]
 
 
 def _about_prior(model: BodyModel) -> list[Metric]:
