@@ -152,13 +152,3 @@ def test_files_that_do_not_belong_together_are_refused(learned, tmp_path):
     np.savez(tmp_path / "bad.npz", **arrays)
     with pytest.raises(ValueError, match="whole_body: expected different vertices"):
         load_model(tmp_path / "bad.npz")
-
-
-def test_the_first_bad_place_of_a_body_is_named():
-    faces = np.concatenate([WHOLE.faces, MODEL.template.faces[:1, ::-1] + 1 + EYE])
-    assert template_problem(take_body(Mesh(WHOLE.vertices, faces))) == "some triangles appear twice"
-    first = MODEL.template.faces[0]
-    fin = np.concatenate([WHOLE.faces, [[*(first[:2] + BODY.start), BODY.start + 3000]]])
-    problem = template_problem(take_body(Mesh(WHOLE.vertices, fin)))
-    places = ["({:.4g}, {:.4g}, {:.4g}) m".format(*MODEL.template.vertices[v]) for v in first[:2]]
-    assert problem is not None and problem.rpartition(" at ")[2] in places

@@ -11,7 +11,6 @@ from model.cli import group
 from model.posing.character import (
     character_model,
     character_pose,
-    points_inside,
     register_character,
 )
 from model.scape import BlendScapeModel
@@ -66,17 +65,6 @@ def test_the_mean_is_the_character_and_betas_move_it_as_they_moved_people(kind):
     moved = [one.vertices(pose, betas) - one.vertices(pose, np.zeros(K)) for one in (model, found)]
     np.testing.assert_allclose(moved[1], moved[0], atol=1e-9)
     np.testing.assert_array_equal(found.vertices(pose), model.vertices(pose))          # None is the template's own body
-
-
-@pytest.mark.parametrize("kind", MODELS)
-def test_of_the_mean_person_it_is_the_same_model(kind):
-    model = MODELS[kind]()
-    J = len(model.skeleton.parents)
-    own = model.vertices(np.zeros((J, 3)), np.zeros(1))
-    found = character_model(model, own, "rest")
-    pose = random_poses(model, 1, np.random.default_rng(1), 0.3)[0]
-    far = np.linalg.norm(found.vertices(pose, np.zeros(1)) - model.vertices(pose, np.zeros(1)), axis=1)
-    assert far.max() < 3e-3 and far.mean() < 6e-4           # how thick a triangle is, no single pose shows
 
 
 @pytest.mark.parametrize("kind", MODELS)
@@ -165,13 +153,6 @@ def test_with_the_template_triangles_nothing_is_registered():
     found = register_character(model, mesh)
     assert found.registration is None and found.mesh is mesh
     np.testing.assert_array_equal(found.model.shape_space.mean, character_model(model, mesh.vertices).shape_space.mean)
-
-
-def test_inside():
-    mesh = worm_model().template
-    middle = np.array([[0.3, -0.2, 0.9], [0.3, -0.2, 1.2], [1.2, -0.2, 0.9], [2.0, -0.2, 0.9]])
-    for one in (mesh, Mesh(mesh.vertices, mesh.faces[:, ::-1])):
-        assert points_inside(one, middle).tolist() == [True, False, True, False]
 
 
 def test_from_the_command_line(drawn, tmp_path, capsys):

@@ -91,12 +91,6 @@ def test_batch_is_the_loop(model, rng):
     assert model.vertices(poses[:0]).shape == subject.vertices(poses[:0]).shape == (0, N, 3)
 
 
-def test_one_pose_serves_many_people(model, rng):
-    pose, betas = random_poses(model, 1, rng)[0], rng.normal(size=(3, 3))
-    for y, mine in zip(model.vertices(pose, betas), betas, strict=True):
-        np.testing.assert_array_equal(y, model.vertices(pose, mine))
-
-
 def test_trans_moves_and_pose_0_turns_about_the_root(model, rng):
     pose, trans = (x[0] for x in at_random(model, rng, 1))
     R = rotations.exp([0.4, 2.0, -1.0])

@@ -2,7 +2,6 @@
 import csv
 import json
 import os
-import shutil
 import signal
 import subprocess
 import sys
@@ -22,7 +21,6 @@ from trees import tree
 import model.coregistration.rounds as rounds_module
 from model import ModelRegistration, coregister, learn_scape, load_model
 from scanprep import RegisteredSet, write_mesh
-from scanprep.batch.digests import Digests
 from scanprep.batch.opening import workspace
 from scanprep.batch.workspace import HOME
 from scanprep.geometry.landmarks import write_landmarks
@@ -106,31 +104,6 @@ def asked(monkeypatch):
 
     monkeypatch.setattr(rounds_module, "register_with_model", ready)
     return calls
-
-
-@pytest.mark.slow
-def test_what_was_kept_is_not_made_again(story, tmp_path, monkeypatch):
-    _, scans, plain, first, done, kept = story
-    shutil.copytree(kept, tmp_path / "kept")
-
-    def forbidden(*args, **kwargs):
-        raise AssertionError("made again")
-
-    monkeypatch.setattr(rounds_module, "register_with_model", forbidden)
-    monkeypatch.setattr(rounds_module, "learn_again", forbidden)
-    with workspace(tmp_path / "kept") as space:
-        again = coregister(first, scans, None, COARSE, list(plain), space=space)
-    for a, b in zip(again.registrations, done.registrations, strict=True):
-        np.testing.assert_array_equal(a.mesh.vertices, b.mesh.vertices)
-        np.testing.assert_array_equal(a.distances, b.distances)
-        assert (a.explained, a.inverted, a.betas) == (b.explained, b.inverted, None)
-    pose = done.registrations[4].pose
-    np.testing.assert_array_equal(again.model.vertices(pose), done.model.vertices(pose))
-    assert digests_of(again.model) == digests_of(done.model)
-
-
-def digests_of(value):
-    return Digests().of(value)
 
 
 CHANGES = {          # what is changed -> scans that are made anew in the first round, and how many after it

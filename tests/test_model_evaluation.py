@@ -10,21 +10,16 @@ from model import LearnConfig, learn_scape
 from model.digests import body_digest, digest, was_trained_on
 from model.evaluation.cli import evaluate, sample
 from model.evaluation.errors import (
-    compactness,
-    fit_with_held_pose,
     pose_errors,
     shape_errors,
-    vertex_components,
 )
-from model.evaluation.page import error_pane
 from model.evaluation.sampling import sample_bodies
-from model.fitting.vertices import FitConfig, ShapeFitter
+from model.fitting.vertices import FitConfig
 from model.posing.cli import mesh as mesh_command
 from model.scape import ScapeModel
 from model.shape_space import ShapeSpace
 from scanprep.dataset import RegisteredSet
 from scanprep.geometry.files import read_mesh, write_mesh
-from scanprep.pictures.scene import picture_panes
 
 
 @pytest.fixture(scope="module")
@@ -98,15 +93,6 @@ def test_every_kind_of_model_is_measured(kind):
     np.testing.assert_allclose(drawn.vertices[1], model.vertices(drawn.poses[1], drawn.betas[1]), atol=1e-12)
 
 
-def test_with_the_right_pose_betas_are_exact(model):
-    # the parts' own rotations are the true ones where the body is the template itself
-    stiff = ScapeModel(model.template, model.skeleton, model.pose_space, ShapeSpace(
-        np.broadcast_to(np.eye(3), (len(model.template.faces), 3, 3)), model.shape_space.components,
-        model.shape_space.variances, model.shape_space.total_variance), model.pose_mean, model.pose_covariance)
-    for made in fit_with_held_pose(stiff, model.template.vertices + [1.0, 2, 3], (1, 3)):
-        np.testing.assert_allclose(made, model.template.vertices + [1.0, 2, 3], atol=1e-9)
-
-
 def test_vertex_pca_is_that_of_the_singular_value_decomposition(model, people):
     train, held = people[:8], people[8:]
     found = shape_errors(model, held, (1, 3), train)
@@ -121,46 +107,11 @@ def test_vertex_pca_is_that_of_the_singular_value_decomposition(model, people):
         np.testing.assert_allclose(errors.by_vertex, far.mean(axis=0), atol=1e-9)
 
 
-def test_vertex_pca_has_no_more_components_than_the_bodies_span(people):
-    mean, components = vertex_components(people[:4], 40)
-    assert components.shape == (3, mean.size)
-    np.testing.assert_allclose(components @ components.T, np.eye(3), atol=1e-10)
-
-
-def test_fitters_of_fewer_components_agree_with_their_own(model, people):
-    shared = ShapeFitter(model).first(2).fit(people[0])
-    own = ShapeFitter(model, FitConfig(n_betas=2)).fit(people[0])
-    np.testing.assert_allclose(shared.vertices, own.vertices, atol=1e-12)
-    warm = ShapeFitter(model).fit(people[0], shared)
-    np.testing.assert_allclose(warm.vertices, people[0], atol=1e-5)
-    with pytest.raises(ValueError, match="n_betas"):
-        ShapeFitter(model).first(4)
-
-
-def test_compactness_rises_to_one(model):
-    share = compactness(model)
-    assert share.shape == (3,) and (np.diff(share) >= 0).all() and share[-1] == pytest.approx(1)
-
-
 def test_random_bodies_are_the_models_and_follow_the_seed(model):
     a, b = (sample_bodies(model, 4, np.random.default_rng(1), pose_too=True) for _ in range(2))
     np.testing.assert_array_equal(a.vertices, b.vertices)
     np.testing.assert_array_equal(a.vertices[2], model.vertices(a.poses[2], a.betas[2]))
     assert not sample_bodies(model, 4, np.random.default_rng(1)).poses.any()
-
-
-def test_random_poses_have_the_moments_of_the_training_poses(model):
-    rng = np.random.default_rng(9)
-    root = rng.normal(size=(9, 12))
-    covariance = np.zeros((12, 12))
-    covariance[3:, 3:] = root[:, :9] @ root[:, :9].T / 90
-    mean = np.zeros((4, 3))
-    mean[1:] = 0.2
-    posed = ScapeModel(model.template, model.skeleton, model.pose_space, model.shape_space, mean, covariance)
-    poses = sample_bodies(posed, 400, np.random.default_rng(0), pose_too=True).poses
-    assert not poses[:, 0].any()                              # the root does not turn
-    assert np.abs(poses.mean(axis=0) - mean).max() < 0.06
-    assert np.abs(np.cov(poses.reshape(400, -1).T) - covariance).max() < 0.3 * covariance.max()
 
 
 def test_a_model_knows_the_bodies_that_trained_it(model, people):
@@ -251,9 +202,3 @@ def test_sample_command_writes_what_the_mesh_command_reads(files):
     again, written = read_mesh(files / "again.ply"), read_mesh(out / "body_2.ply")
     np.testing.assert_allclose(again.vertices, written.vertices, atol=1e-9)
     assert (out / "sheet.png").stat().st_size > 5000
-
-
-def test_error_map_shows_where_the_error_is(model):
-    far = np.where(model.template.vertices[:, 0] > 0.3, 0.02, 0.0)
-    clean, spotted = (picture_panes([error_pane(model.template, d, "")], 300) for d in (0 * far + 1e-4, far))
-    assert clean.shape == spotted.shape and (clean != spotted).any(axis=2).mean() > 0.05
