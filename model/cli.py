@@ -75,8 +75,7 @@ def about(model: BodyModel) -> list[Metric]:
         rows.append(Metric("differences between the people that they explain", 100 * float(model.explained[-1]), "%"))
     if model.template.attached is not None:
         rows.append(Metric("components", str(model.template.attached)))
-    return [*rows, Metric("up", "xyz"[guess_upright(model.template)[0]]),
-            Metric("numbers that a pose is described by", model.n_features, detail=True)]
+    return [*rows, Metric("up", "xyz"[guess_upright(model.template)[0]])]
 
 
 def import_file(model: ModelArg, output: Output, up: Up | None = None) -> Outcome:

@@ -47,7 +47,6 @@ def at_random(model, rng, count, size=0.5):
 def test_it_says_what_it_is(model):
     assert isinstance(model, BodyModel) and model.n_betas == 3
     assert model.kind in repr(model).lower() and len(repr(model)) < 200
-    assert model.n_features == model.features.count
     assert (np.diff(model.explained) >= 0).all() and model.explained[-1] == pytest.approx(1)
 
 

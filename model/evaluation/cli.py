@@ -23,7 +23,7 @@ from ..digests import digest, was_trained_on
 from ..files import load_model
 from ..posing.cli import read_subject
 from ..shape_statistics import SEXES, WORDS, Sex
-from .errors import Errors, compactness, errors_problem, pose_errors, shape_errors
+from .errors import Errors, errors_problem, pose_errors, shape_errors
 from .page import MM, Findings, evaluation_page, generalisation_rows, picture_samples
 from .sampling import sample_bodies
 
@@ -144,12 +144,11 @@ def _metrics(model: BodyModel, found: Findings) -> list[Metric]:
         rows += _about("poses", found.poses.errors, found.pose_names, found.poses.converged)
     if found.shapes is not None:
         rows += _about("people", found.shapes.errors[-1], found.shape_names, found.shapes.converged)
-        for count, fitted, _, _, held, pca in generalisation_rows(found.shapes):
-            rows += [Metric(f"people, components {count}", fitted, "mm"),
-                     Metric(f"people, components {count}, pose held", held, "mm")]
+        for count, fitted, _, _, pca in generalisation_rows(found.shapes):
+            rows.append(Metric(f"people, components {count}", fitted, "mm"))
             if found.shapes.vertex_pca is not None:
                 rows.append(Metric(f"people, components {count}, vertex PCA", pca, "mm"))
-            rows.append(Metric(f"variance, components {count}", 100 * float(compactness(model)[count - 1]), "%"))
+            rows.append(Metric(f"variance, components {count}", 100 * float(model.explained[count - 1]), "%"))
     return rows
 
 

@@ -71,7 +71,7 @@ def _shape_section(page: Page, model: BodyModel, found: Findings) -> None:
     assert shapes is not None and bodies is not None
     page.section("People", "Of every person shape, pose and place were fitted, with more and more components.")
     page.table(generalisation_rows(shapes), ("components", "fitted (mm)", "95th percentile (mm)", "worst vertex (mm)",
-                                             "pose held (mm)", "vertex PCA (mm)"))
+                                             "vertex PCA (mm)"))
     # with all components: where the error lies, and the best and the worst person
     last, count = shapes.errors[-1], int(shapes.counts[-1])
     rest = model.template.with_vertices(model.vertices(np.zeros_like(shapes.poses[0, 0]), np.zeros(1)))
@@ -81,11 +81,11 @@ def _shape_section(page: Page, model: BodyModel, found: Findings) -> None:
                 "the best and the worst person: as given, then the fitted body coloured by its error")
 
 
-def generalisation_rows(shapes: ShapeErrors) -> list[tuple[int, float, float, float, float, float]]:
-    """List by components: fitted, 95th percentile, worst vertex, pose held, vertex PCA (NaN without), millimetres."""
+def generalisation_rows(shapes: ShapeErrors) -> list[tuple[int, float, float, float, float]]:
+    """List by components: fitted, 95th percentile, worst vertex, vertex PCA (NaN without), millimetres."""
     pca = [np.nan] * len(shapes.counts) if shapes.vertex_pca is None else [MM * e.overall for e in shapes.vertex_pca]
-    return [(int(k), MM * e.overall, MM * float(e.p95.mean()), MM * float(e.worst.max()), MM * held.overall, plain)
-            for k, e, held, plain in zip(shapes.counts, shapes.errors, shapes.pose_held, pca, strict=True)]
+    return [(int(k), MM * e.overall, MM * float(e.p95.mean()), MM * float(e.worst.max()), plain)
+            for k, e, plain in zip(shapes.counts, shapes.errors, pca, strict=True)]
 
 
 def error_pane(body: Mesh, distance: np.ndarray, title: str) -> Pane:

@@ -98,11 +98,11 @@ def resolution_gap(model: BodyModel, changed: BodyModel, poses: np.ndarray, beta
     return np.array(gaps)
 
 
-def subdivide_at_middles(mesh: Mesh, times: int = 1) -> Mesh:
+def subdivide_at_middles(mesh: Mesh) -> Mesh:
     """Cut every triangle into four at the middles of its sides; the surface stays the same."""
     import igl
 
-    return Mesh(*igl.upsample(mesh.vertices, mesh.faces, times))
+    return Mesh(*igl.upsample(mesh.vertices, mesh.faces, 1))
 
 
 def resample(mesh: Mesh, vertices: int) -> Mesh:
