@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from people_bodies import make_model
 
-from completion.cli import read_landmark_pairs, read_model
+from completion.cli import read_model
 from completion.mocap.joint_angles import anatomical_angles
 from completion.motion import Motion
 from completion.viewing.kinds import model_of_report
@@ -124,15 +124,3 @@ def test_fingers_bend_in_their_bones():
     lift = people.rows(np.zeros(0))[0] - people.mean[0] - (rows - people.mean - np.tensordot(
         betas, people.directions, axes=1))[0]
     np.testing.assert_allclose(model.rest_joints(np.array(betas))[1:16], rows[12501:12516] + lift, atol=2e-3)
-
-
-def test_landmarks_of_a_scan_are_matched_by_name(model, tmp_path):
-    marks = tmp_path / "marks.json"
-    marks.write_text('{"navel": [0, 1, 2], "left heel": [3, 4, 5], "right heel": [6, 7, 8], "other": [0, 0, 0]}')
-    vertices, points = read_landmark_pairs(model, "m", marks, None, "m")
-    found = dict(zip(vertices.tolist(), points.tolist(), strict=True))
-    assert found == {model.info["landmarks"][n]: p for n, p in
-                     (("navel", [0, 1, 2]), ("left heel", [3, 4, 5]), ("right heel", [6, 7, 8]))}
-    marks.write_text('{"navel": [0, 1, 2]}')
-    with pytest.warns(UserWarning, match=r"marks\.json.*template: .*left heel.*scan: navel; going on without"):
-        assert read_landmark_pairs(model, "m", marks, None, "m") is None

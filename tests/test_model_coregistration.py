@@ -10,15 +10,10 @@ from jointed_bodies import bent
 from model_bodies import random_poses, worm_model
 
 from model import learn_scape, register_with_model
-from model.bilinear import PosedPoints
 from model.fitting.bodies import ResizedBody, as_body
-from model.fitting.rounds import meet_vertices
-from model.fitting.scan import prepare_scan
-from model.fitting.scan_fit import scan_fit
 from scanprep.geometry.surface import Surface
 from scanprep.registration.nonrigid import register
 
-NOTHING = np.zeros(0, dtype=np.int64), np.zeros((0, 3))
 NEAR = np.array([0, 0.1, 0.05]), np.array([0.1, 0.0, -0.15])
 
 
@@ -88,28 +83,6 @@ def test_betas_are_found_with_the_pose():
     found = register_with_model(worm, scan_of(worm.template, truth), (marks, truth[marks]), pose, sharp)
     assert found.betas is not None and found.betas == pytest.approx(betas, abs=0.3)
     assert mean_mm(found.mesh.vertices, truth) < 5
-
-
-@pytest.mark.parametrize("known", [True, False], ids=["subject", "betas"])
-def test_derivatives_agree_with_finite_differences(known):
-    worm = worm_model()
-    body = worm.subject([1.0, 0, 0]) if known else worm
-    points = PosedPoints(body.points(np.array([3, 50, 200, 390])))
-    x = np.random.default_rng(2).normal(0, 0.4, points.n_unknowns)
-    y, columns = points.columns(x)
-    np.testing.assert_allclose(y, points.positions(x), atol=1e-12)
-    np.testing.assert_allclose(np.swapaxes(columns, 0, 2), differences(points.positions, x), atol=1e-7)
-
-
-def test_vertices_without_weight_do_not_count(body, crab_model):
-    free = replace(QUICK.fit, prior_weight=1e-9)
-    fit = scan_fit(as_body(crab_model.subject()), prepare_scan(body), *NOTHING, free)
-    pose = np.array([[0.1, 0, 0.2], [0, 0.5, 0.1], [0.1, -0.4, 0]])
-    vertices = np.asarray(crab_model.subject().vertices(pose, np.array([0.1, 0, 0])))
-    wrong = body.vertices[:, 1] > 0.02
-    x = meet_vertices(fit, np.zeros(12), vertices + 0.3 * wrong[:, None], (~wrong).astype(float))
-    np.testing.assert_allclose(fit.body.split(x)[0], pose, atol=2e-3)
-    np.testing.assert_allclose(fit.body.split(x)[1], [0.1, 0, 0], atol=1e-3)
 
 
 @pytest.mark.parametrize("known", [True, False], ids=["subject", "betas"])

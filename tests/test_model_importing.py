@@ -10,10 +10,8 @@ from scipy.sparse import csc_array
 
 from model.export.correctives import write_body_npz
 from model.files import load_model
-from model.fitting.vertices import fit_shape
 from model.importing import NAMES, import_model
 from model.learning.scape import judge_model
-from model.resolution.change import change_resolution, resample
 from model.rig import joint_places, make_rig
 
 
@@ -70,18 +68,6 @@ def test_joints_that_rest_in_poses_of_nobody_are_no_doubt(both):
 
 def smplx_hand():
     return as_smplx(smpl())["hands_meanl"]
-
-
-def test_people_are_fitted_and_the_resolution_changes(both):
-    _, model = both
-    (pose,), (betas,), (trans,) = drawn(model, 1, 5)
-    pose, betas = 0.4 * pose, 0.5 * betas
-    fit = fit_shape(model, model.vertices(pose, betas, trans))
-    assert fit.mean < 1e-3
-    if len(model.skeleton.parents) == 55:                # its fingers are single triangles here
-        return
-    coarse = change_resolution(model, resample(model.template, 1000))
-    np.testing.assert_allclose(coarse.rest_joints(betas), model.rest_joints(betas), rtol=0, atol=1e-9)
 
 
 def test_our_own_export_comes_back(tmp_path):

@@ -114,13 +114,6 @@ def test_files_say_up(folder, tmp_path):
         RegisteredSet.load(tmp_path / "set")
 
 
-def test_what_has_no_legs_has_its_longest_axis_up():
-    """Points in a line, and a stick that lies."""
-    assert find_up(Mesh([[0, 0, 0], [0, 0, 1], [0, 0, 2]], [[0, 1, 2]])).up == 2
-    stick = [[x, y, z] for x in (0, 2) for y, z in ((0, 0), (0.1, 0), (0, 0.1))]
-    assert find_up(Mesh(stick, [[0, 1, 2], [3, 4, 5], [0, 3, 1], [0, 3, 2], [1, 4, 2]])).up == 0
-
-
 @pytest.mark.slow
 def test_a_man_in_any_pose_keeps_his_up(real_data):
     """Each of the poses of SCAPE as the template of all, bent ones too."""

@@ -144,6 +144,7 @@ def _metrics(model: BodyModel, found: Findings) -> list[Metric]:
         rows += _about("poses", found.poses.errors, found.pose_names, found.poses.converged)
     if found.shapes is not None:
         rows += _about("people", found.shapes.errors[-1], found.shape_names, found.shapes.converged)
+        # how much every number of components leaves, and plain PCA of vertices beside it
         for count, fitted, _, _, pca in generalisation_rows(found.shapes):
             rows.append(Metric(f"people, components {count}", fitted, "mm"))
             if found.shapes.vertex_pca is not None:
