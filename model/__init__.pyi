@@ -35,7 +35,6 @@ from .measurement.measure import measure as measure
 from .measurement.wanted import body_with_measurements as body_with_measurements
 from .motion.bvh import read_bvh as read_bvh
 from .motion.onto import read_motion as read_motion
-from .posing.poses import mirror_pose as mirror_pose
 from .posing.poses import pose_from_angles as pose_from_angles
 from .posing.transfer import subject_from_body as subject_from_body
 from .priors import sample_poses as sample_poses

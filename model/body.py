@@ -120,11 +120,6 @@ class BodyModel(ABC):
     def explained(self) -> np.ndarray:
         """(K,) share of the shape variance of the training people that the first 1..K components explain."""
 
-    @property
-    def n_features(self) -> int:
-        """The number of features, constants included."""
-        return self.features.count
-
     @cached_property
     def joint_regressor(self) -> csr_array:
         """(J, N) weights: `joint_regressor @ vertices` are the joints of a body."""

@@ -27,7 +27,7 @@ COMMANDS = {
     "import": ("A body model of the SMPL family's layout, MHR or SOMA-X as ours.", "model.cli:import_file"),
     "mesh": ("The mesh of one pose and shape.", "model.posing.cli:mesh"),
     "sample": ("Random bodies: meshes, a sheet of pictures, betas and poses.", "model.evaluation.cli:sample"),
-    "evaluate": ("Errors on held-out bodies, with a page of curves and pictures.", "model.evaluation.cli:evaluate"),
+    "evaluate": ("Errors on held-out bodies, with a page of pictures.", "model.evaluation.cli:evaluate"),
     "resample": ("The model with fewer or more triangles.", "model.resolution.cli:resample_model"),
     "coregister": ("Scans registered with a model as prior, and the model learned again.",
                    "model.coregistration.cli:coregister_scans"),
@@ -75,8 +75,7 @@ def about(model: BodyModel) -> list[Metric]:
         rows.append(Metric("differences between the people that they explain", 100 * float(model.explained[-1]), "%"))
     if model.template.attached is not None:
         rows.append(Metric("components", str(model.template.attached)))
-    return [*rows, Metric("up", "xyz"[guess_upright(model.template)[0]]),
-            Metric("numbers that a pose is described by", model.n_features, detail=True)]
+    return [*rows, Metric("up", "xyz"[guess_upright(model.template)[0]])]
 
 
 def import_file(model: ModelArg, output: Output, up: Up | None = None) -> Outcome:

@@ -2,7 +2,6 @@
 from __future__ import annotations
 
 import importlib
-import warnings
 from collections.abc import Callable
 from pathlib import Path
 
@@ -53,7 +52,4 @@ def load_model(path: str | Path) -> BodyModel:
         raise storage.StorageError(f"{path}: expected a body model of kind {', '.join(KINDS)}, found '{kind}'")
     module, name = KINDS[kind]
     model: BodyModel = getattr(importlib.import_module(module), name).load(path)
-    if model.info.get("name") == "synthetic people":
-        warnings.warn(f"{path}: these are the built-in people of an earlier version, who were made up; those of now "
-                      f"have the statistics of people who were measured: -m {BUILT_IN}", stacklevel=2)
     return model

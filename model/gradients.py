@@ -25,7 +25,8 @@ class GradientSystem:
     """The least-squares systems of Eq. 5 and Eq. 8 over the triangles of one template.
 
     Each row of a gradient has three unknowns a triangle, and the three rows share one matrix. With `parts` (F,),
-    neighbours in different parts are not smoothed. w_s is the smoothness times the mean edge length in metres.
+    neighbours in different parts are not smoothed. w_s is the smoothness times the mean edge length in metres; 0.001 is
+    the paper's.
 
     [SCAPE] Eq. 5
     """

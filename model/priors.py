@@ -17,14 +17,18 @@ CRUDE = 0.022
 STIFF = np.radians(5)                # a joint that turned less than this in every pose counts as never bent
 
 
-def whitening(covariance: np.ndarray, shrinkage: float = 0.3, floor: float = 0.15) -> np.ndarray:
+SHRINKAGE = 0.3                      # share of the diagonal: few poses show correlations between joints by chance
+FLOOR = 0.05                         # radians added to the spread of each angle: no joint is as stiff as few poses show
+
+
+def whitening(covariance: np.ndarray, shrinkage: float = SHRINKAGE) -> np.ndarray:
     """Compute the matrix (3J - 3, 3J) that takes poses minus their mean to unit covariance; the root is free.
 
     Few training poses show correlations by chance. So the covariance (3J, 3J) is shrunk towards its diagonal by the
-    share `shrinkage`, and the variance `floor`² (radians) is added to every angle.
+    share `shrinkage`, and the variance `FLOOR`² is added to every angle.
     """
     inner = covariance[3:, 3:]
-    safe = (1 - shrinkage) * inner + np.diag(shrinkage * np.diag(inner) + floor**2)
+    safe = (1 - shrinkage) * inner + np.diag(shrinkage * np.diag(inner) + FLOOR**2)
     W = np.zeros((len(inner), len(covariance)))
     W[:, 3:] = np.linalg.inv(np.linalg.cholesky(safe))
     return W
@@ -42,8 +46,7 @@ class GaussianPrior:
         return float(((self.whitening @ (pose.ravel() - self.mean))**2).sum())
 
 
-def gaussian_prior(mean: np.ndarray, covariance: np.ndarray, shrinkage: float = 0.3, floor: float = 0.05
-                   ) -> GaussianPrior:
+def gaussian_prior(mean: np.ndarray, covariance: np.ndarray, shrinkage: float = SHRINKAGE) -> GaussianPrior:
     """Build the prior from mean (J, 3) and covariance (3J, 3J) of training poses, regularised by `whitening`."""
     mean = np.asarray(mean, dtype=np.float64).reshape(-1)
     covariance = np.asarray(covariance, dtype=np.float64)
@@ -51,20 +54,20 @@ def gaussian_prior(mean: np.ndarray, covariance: np.ndarray, shrinkage: float = 
         raise ValueError(f"covariance: expected shape {(len(mean), len(mean))}, got {covariance.shape}")
     if not (np.isfinite(mean).all() and np.isfinite(covariance).all()):
         raise ValueError("mean, covariance: expected finite values")
-    return GaussianPrior(mean, whitening(covariance, shrinkage, floor))
+    return GaussianPrior(mean, whitening(covariance, shrinkage))
 
 
-def typical_poses(mean: np.ndarray, covariance: np.ndarray, axes: int, deviation: float = 1.5) -> np.ndarray:
+def typical_poses(mean: np.ndarray, covariance: np.ndarray, axes: int) -> np.ndarray:
     """List typical poses (at most 1 + 2 axes, J, 3): the mean, and steps both ways along its principal axes.
 
-    Each step is `deviation` standard deviations long; the root is not turned.
+    Each step is 1.5 standard deviations long, as a pose of every eighth person; the root is not turned.
     """
     mean = np.array(mean, dtype=np.float64)
     mean[0] = 0
     variance, direction = np.linalg.eigh(np.asarray(covariance)[3:, 3:])
     kept = np.argsort(-variance)[:min(axes, int((variance > 1e-9).sum()))]
     step = np.zeros((len(kept), mean.size))
-    step[:, 3:] = deviation * (np.sqrt(variance[kept]) * direction[:, kept]).T
+    step[:, 3:] = 1.5 * (np.sqrt(variance[kept]) * direction[:, kept]).T
     return mean + np.concatenate([np.zeros((1, mean.size)), step, -step]).reshape(-1, *mean.shape)
 
 

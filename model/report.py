@@ -14,6 +14,8 @@ from scanprep.skeleton.tree import Skeleton
 
 from .body import BodyModel
 
+HEIGHT = 420                         # pixels: as many panes side by side as a screen is wide
+
 
 def parts_panes(template: Mesh, skeleton: Skeleton) -> list[Pane]:
     """Draw the parts in colour, then joints and bones inside a transparent body."""
@@ -26,23 +28,23 @@ def parts_panes(template: Mesh, skeleton: Skeleton) -> list[Pane]:
             Pane(inside, camera, "joints")]
 
 
-def picture_parts(template: Mesh, skeleton: Skeleton, height: int = 640) -> np.ndarray:
+def picture_parts(template: Mesh, skeleton: Skeleton) -> np.ndarray:
     """Picture parts and joints from the front, and the parts from the back."""
     panes, (back,) = parts_panes(template, skeleton), look_around(template, turns=(195,))
-    return picture_panes([*panes, replace(panes[0], camera=back, label="back")], height)
+    return picture_panes([*panes, replace(panes[0], camera=back, label="back")], 640)
 
 
-def component_panes(model: BodyModel, count: int = 4, deviations: float = 2.0) -> list[Pane]:
-    """Draw the mean person, then the first components at minus and plus some standard deviations.
+def component_panes(model: BodyModel) -> list[Pane]:
+    """Draw the mean person, then the first four components at minus and plus two standard deviations.
 
     [SCAPE] Eq. 7
     """
     J = len(model.skeleton.parents)
-    count = min(count, model.n_betas)
+    count = min(4, model.n_betas)
     wanted = [("mean", np.zeros(1))]
     for k in range(count):
         for sign in (-1, 1):
-            wanted.append((f"{k + 1}: {sign * deviations:+.0f} sd", sign * deviations * np.eye(count)[k]))
+            wanted.append((f"{k + 1}: {sign * 2:+} sd", sign * 2.0 * np.eye(count)[k]))
     up = model.template.up
     bodies = [model.template.with_vertices(model.vertices(np.zeros((J, 3)), betas, np.zeros(3)), up)
               for _, betas in wanted]
@@ -50,15 +52,15 @@ def component_panes(model: BodyModel, count: int = 4, deviations: float = 2.0) -
     return [Pane([body], camera, name) for body, (name, _) in zip(bodies, wanted, strict=True)]
 
 
-def picture_components(model: BodyModel, height: int = 420) -> np.ndarray:
+def picture_components(model: BodyModel) -> np.ndarray:
     """Picture the panes of `component_panes`.
 
     [SCAPE] Eq. 7
     """
-    return picture_panes(component_panes(model), height)
+    return picture_panes(component_panes(model), HEIGHT)
 
 
-def picture_character(model: BodyModel, count: int = 4, height: int = 420) -> np.ndarray:
+def picture_character(model: BodyModel) -> np.ndarray:
     """Picture the character with its parts and its joints, then in poses of the model's people that are far from rest.
     """
     skeleton, betas = model.skeleton, np.zeros(1)
@@ -67,11 +69,11 @@ def picture_character(model: BodyModel, count: int = 4, height: int = 420) -> np
     joints = model.joint_regressor @ body.vertices
     # training poses from the most bent on; the more bent half is shown, evenly spread
     examples = model.pose_examples[np.argsort(-np.abs(model.pose_examples[:, 1:]).sum(axis=(1, 2)), kind="stable")]
-    chosen = np.linspace(0, max(len(examples) - 1, 0) // 2, min(count, len(examples))).astype(int)
+    chosen = np.linspace(0, max(len(examples) - 1, 0) // 2, min(4, len(examples))).astype(int)
     poses = examples[chosen].reshape(-1, *rest.shape)
     poses[:, 0] = 0
     bodies = model.vertices(poses, np.tile(betas, (len(poses), 1)))
     panes = [*parts_panes(body, replace(skeleton, joints=joints)),
              *(Pane([model.template.with_vertices(v)], look_around(body, v, (35,))[0], f"pose {k + 1}")
                for k, v in enumerate(bodies))]
-    return picture_panes(panes, height)
+    return picture_panes(panes, HEIGHT)

@@ -135,8 +135,7 @@ class Rig:
         return self.transform(turn_up(up))
 
 
-def make_rig(model: BodyModel, betas: np.ndarray | None = None, shapes: int = 0, weights: np.ndarray | None = None
-             ) -> Rig:
+def make_rig(model: BodyModel, betas: np.ndarray | None = None, shapes: int = 0) -> Rig:
     """Build the rig of one person, for linear blend skinning.
 
     Parameters
@@ -147,18 +146,17 @@ def make_rig(model: BodyModel, betas: np.ndarray | None = None, shapes: int = 0,
         None is the template's own body, which has no shapes.
     shapes : int
         Number of first betas that become shapes, at most all of the model.
-    weights : (N, J) float, optional
-        Without them, those of a skinning model or of `skin_weights`. The largest `CARRIERS` of every vertex are kept.
 
     Returns
     -------
     Rig
-        The mesh at rest with its skeleton, weights (N, J) and shapes, as `write_skinned_glb` takes it.
+        The mesh at rest with its skeleton, weights (N, J) and shapes, as `write_skinned_glb` takes it. The weights are
+        those of a skinning model or of `skin_weights`; the largest `CARRIERS` of every vertex are kept.
 
     Raises
     ------
     ValueError
-        Weights of another shape, shapes of the template's own body.
+        Shapes of the template's own body.
 
     Examples
     --------
@@ -172,7 +170,7 @@ def make_rig(model: BodyModel, betas: np.ndarray | None = None, shapes: int = 0,
     rest = np.zeros((len(model.skeleton.parents), 3))
     mesh = model.template.with_vertices(model.vertices(rest, betas), model.template.up)
     return Rig(mesh, replace(model.skeleton, joints=model.rest_joints(betas)),
-               strongest(model.skin_weights if weights is None else weights),
+               strongest(model.skin_weights),
                np.moveaxis(model.shape_jacobian(rest)[..., :shapes], -1, 0))
 
 

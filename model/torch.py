@@ -381,9 +381,8 @@ class BodyLayer(nn.Module):
         self.n_betas = self.points.n_betas
         self.to(dtype)
 
-    def forward(self, poses: Tensor | None = None, betas: Tensor | None = None, trans: Tensor | None = None,
-                vertices: Tensor | None = None, *, global_orient: Tensor | None = None,
-                body_pose: Tensor | None = None, transl: Tensor | None = None) -> tuple[Tensor, Tensor]:
+    def forward(self, poses: Tensor | None = None, betas: Tensor | None = None, trans: Tensor | None = None
+                ) -> tuple[Tensor, Tensor]:
         """Compute vertices and joints of a batch of bodies, or of one body where poses and betas have no batch.
 
         Parameters
@@ -394,14 +393,6 @@ class BodyLayer(nn.Module):
             None is the template's own body; zeros are the mean person.
         trans : (B, 3) or (3,) tensor, metres, optional
             Travel of the root's joint; zero where none is given.
-        vertices : (L,) int tensor, optional
-            Return these only. All are computed first; for a fixed choice give `vertices` to the layer instead.
-        global_orient : (B, 3) tensor, radians, optional
-            The first row of poses, under the name smplx gives it.
-        body_pose : (B, 3 (J - 1)) or (B, J - 1, 3) tensor, radians, optional
-            The other rows.
-        transl : (B, 3) tensor, metres, optional
-            Another name of `trans`.
 
         Returns
         -------
@@ -411,10 +402,9 @@ class BodyLayer(nn.Module):
         Raises
         ------
         ValueError
-            Shapes that do not fit, or one thing given under two names.
+            Shapes that do not fit.
         """
-        # arguments under either name, with shapes that fit
-        poses, trans = self._resolve_names(poses, trans, global_orient, body_pose, transl)
+        # arguments whose shapes fit
         like = self.mix
         pose = like.new_zeros(self.n_joints, 3) if poses is None else poses
         if pose.shape[-1] == 3 * self.n_joints:
@@ -445,8 +435,6 @@ class BodyLayer(nn.Module):
         y = self.points(R, features, lifted, betas)
         joints = self.regressor @ y.index_select(1, self.ring) if self.joints is None else \
             self.joints(R, features, lifted, betas)
-        if vertices is not None:
-            y = y.index_select(1, vertices)
         if trans is not None:
             y, joints = y + trans[:, None], joints + trans[:, None]
         return (y, joints) if batched else (y[0], joints[0])
@@ -458,31 +446,6 @@ class BodyLayer(nn.Module):
         for parts, above in zip(self.depths[1:], self.above, strict=True):
             by_depth.append(by_depth[-1][:, above] @ relative[:, parts])
         return torch.cat(by_depth, 1)[:, self.back]
-
-    def _resolve_names(self, poses: Tensor | None, trans: Tensor | None, global_orient: Tensor | None,
-                       body_pose: Tensor | None, transl: Tensor | None) -> tuple[Tensor | None, Tensor | None]:
-        """Return poses and trans, given under our names or those of smplx; ValueError for both."""
-        if transl is not None:
-            if trans is not None:
-                raise ValueError("trans, transl: expected one of them, they are the same")
-            trans = transl
-        if global_orient is None and body_pose is None:
-            return poses, trans
-        if poses is not None:
-            raise ValueError("poses: expected none beside global_orient and body_pose, which are its rows")
-        # rows of the pose, one of which may be missing and is then zero
-        root = None if global_orient is None else global_orient.flatten(1) if global_orient.ndim > 1 else \
-            global_orient[None]
-        others = None if body_pose is None else body_pose.flatten(1) if body_pose.ndim > 1 else body_pose[None]
-        like = root if root is not None else others
-        assert like is not None, "one of them is given"
-        J = self.n_joints
-        root = like.new_zeros(like.shape[0], 3) if root is None else root
-        others = like.new_zeros(like.shape[0], 3 * (J - 1)) if others is None else others
-        if root.shape[1:] != (3,) or others.shape[1:] != (3 * (J - 1),) or root.shape[0] != others.shape[0]:
-            raise ValueError(f"global_orient, body_pose: expected shapes (B, 3) and (B, {3 * (J - 1)}), "
-                             f"got {tuple(root.shape)} and {tuple(others.shape)}")
-        return torch.cat([root, others], -1).unflatten(-1, (J, 3)), trans
 
 
 def _features_of(operator: PointOperator) -> PoseFeatures:

@@ -18,7 +18,7 @@ from completion.mocap.retargeting.soft_tissue import (
 )
 from completion.mocap.soft_tissue.soft_tissue import SoftTissue
 from model.fitting.bodies import at_rest
-from model.posing.character import CharacterConfig, character_model
+from model.posing.character import character_model
 from scanprep.geometry import rotations
 from scanprep.geometry.format_glb import turn_up
 from scanprep.pictures.camera import guess_upright
@@ -45,7 +45,7 @@ def soft():
 def character(model):
     own = model.vertices(np.zeros((4, 3)), np.zeros(1))
     thick = own.mean(axis=0) + (own - own.mean(axis=0)) * [0.6, 1.5, 1.8]
-    return character_model(model, thick, CharacterConfig(pose="rest"))
+    return character_model(model, thick, "rest")
 
 
 def test_soft_tissue_is_added_to_the_character(model, soft, character):

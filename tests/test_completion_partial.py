@@ -9,7 +9,7 @@ from completion.partial.settings import CompletionConfig
 from model.fitting.bodies import FixedBody
 from model.fitting.free_space import Contact
 from model.fitting.limbs import limb_runs, redrawn
-from model.priors import gaussian_prior
+from model.priors import FLOOR, gaussian_prior
 from scanprep.geometry import rotations
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.surface import Surface
@@ -142,7 +142,7 @@ def test_limbs_are_drawn_from_the_prior_given_the_rest(model):
     covariance = np.zeros((12, 12))
     root = np.random.default_rng(0).normal(size=(9, 9))
     covariance[3:, 3:] = root @ root.T / 20
-    prior = gaussian_prior(model.pose_mean, covariance, 0, 0)
+    prior = gaussian_prior(model.pose_mean, covariance - FLOOR**2 * np.diag(np.arange(12) > 2), 0)
     x = np.random.default_rng(1).normal(0, 0.3, 15)
     assert limb_runs(model.skeleton) == [[2, 3], [1]]
     drawn = redrawn(body, x, 2, prior, 20000, np.random.default_rng(2))

@@ -3,7 +3,7 @@ import pytest
 
 from model.fitting import energy
 from model.fitting.limbs import runs_without_branch
-from model.priors import JointLimits, gaussian_prior, typical_poses
+from model.priors import FLOOR, JointLimits, gaussian_prior, typical_poses
 
 EXAMPLES = np.random.default_rng(7).normal(0, 0.4, (12, 4, 3)) * (np.arange(4) > 0)[:, None]
 
@@ -18,7 +18,7 @@ def moments(J=4, seed=0):
 
 def test_whitened_poses_have_unit_covariance():
     mean, covariance = moments()
-    prior = gaussian_prior(mean, covariance, shrinkage=0, floor=0)
+    prior = gaussian_prior(mean, covariance - FLOOR**2 * np.diag(np.arange(12) > 2), shrinkage=0)
     np.testing.assert_allclose(prior.whitening @ covariance @ prior.whitening.T, np.eye(9), atol=1e-9)
     np.testing.assert_array_equal(prior.whitening[:, :3], 0)           # the root turns freely
 
@@ -28,7 +28,7 @@ def test_shrinkage_and_floor_make_a_covariance_of_few_poses_safe():
     poses = rng.normal(0, 0.4, (5, 12))                                 # five poses, nine angles: singular
     covariance = np.cov(poses.T)
     covariance[:3] = covariance[:, :3] = 0
-    prior = gaussian_prior(poses.mean(axis=0).reshape(4, 3), covariance, 0.3, 0.05)
+    prior = gaussian_prior(poses.mean(axis=0).reshape(4, 3), covariance, 0.3)
     inner = covariance[3:, 3:]
     wanted = 0.7 * inner + np.diag(0.3 * np.diag(inner) + 0.05**2)
     np.testing.assert_allclose(np.linalg.inv(prior.whitening[:, 3:].T @ prior.whitening[:, 3:]), wanted, atol=1e-10)
@@ -36,7 +36,7 @@ def test_shrinkage_and_floor_make_a_covariance_of_few_poses_safe():
 
 def test_typical_poses_are_steps_along_the_main_directions():
     mean, covariance = moments()
-    poses = typical_poses(mean, covariance, axes=2, deviation=1.5)
+    poses = typical_poses(mean, covariance, axes=2)
     assert poses.shape == (5, 4, 3)
     np.testing.assert_array_equal(poses[:, 0], 0)
     np.testing.assert_allclose(poses[0, 1:], mean[1:])

@@ -1,19 +1,17 @@
 """The model of the built-in people: that of the population, in the wheel, made by its recipe."""
 import json
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 from people_bodies import make_model
 
-from completion.cli import read_landmark_pairs, read_model
+from completion.cli import read_model
 from completion.mocap.joint_angles import anatomical_angles
 from completion.motion import Motion
 from completion.viewing.kinds import model_of_report
 from model import fit_pose, load_model
-from model.built_in import STORED, load_built_in_model, load_fingered_model, pack_coefficients, unpack_coefficients
-from model.files import LOADERS
+from model.built_in import STORED, load_built_in_model, load_fingered_model
 from scanprep.geometry import storage
 from scanprep.synthetic.landmarks import landmarks, markers
 from scanprep.synthetic.people import BodyShape, SyntheticPerson, random_pose
@@ -89,13 +87,6 @@ def test_it_knows_poses_within_the_ranges_of_joints(model):
             assert np.ptp(angles) > 15
 
 
-def test_packed_coefficients_are_the_same_to_the_last_digits(model):
-    space = model.pose_space
-    again = unpack_coefficients(space.features, *pack_coefficients(space))
-    for one, other in zip(space.coefficients, again, strict=True):
-        np.testing.assert_allclose(one, other, atol=np.abs(one).max() / 2**15)
-
-
 def test_it_is_named_people_wherever_a_model_is_asked_for(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     assert load_model("people") is load_built_in_model() and load_model("people-fingers").kind == "skinning"
@@ -103,25 +94,6 @@ def test_it_is_named_people_wherever_a_model_is_asked_for(tmp_path, monkeypatch)
     Path("people").write_bytes(b"a file of mine")
     with pytest.raises(storage.StorageError, match="people: "):
         load_model("people")
-
-
-def test_a_file_of_the_old_people_works_and_is_told_to_be_old(tmp_path):
-    path, old = tmp_path / "old.npz", replace(load_built_in_model(), info={"name": "synthetic people"})
-    old.save(path)
-    with pytest.warns(UserWarning, match=r"old\.npz: .*earlier version.*made up.*-m people"):
-        assert load_model(path).n_betas == 30
-
-
-@pytest.mark.parametrize(("named", "known"), [
-    ("people", True), ("people-fingers", True), ("model.npz", True), ("gone.npz", False),
-    ("synthetic people, built 2026-01-01, cached at /home/me/.cache/scapekit/synthetic-people-6cc7.npz", False)])
-def test_models_that_reports_name(tmp_path, monkeypatch, named, known):
-    """The old built-in people are gone, and so are their cached files: their betas mean nothing here."""
-    monkeypatch.chdir(tmp_path)
-    Path("model.npz").write_text("")
-    Path("report.json").write_text(json.dumps({"settings": {"model": named}}))
-    found = model_of_report(Path("report.json"))
-    assert found == (None if not known else Path(named) if named in LOADERS else Path(named).absolute())
 
 
 def test_a_model_that_was_moved_with_its_results_is_found(tmp_path, monkeypatch):
@@ -152,27 +124,3 @@ def test_fingers_bend_in_their_bones():
     lift = people.rows(np.zeros(0))[0] - people.mean[0] - (rows - people.mean - np.tensordot(
         betas, people.directions, axes=1))[0]
     np.testing.assert_allclose(model.rest_joints(np.array(betas))[1:16], rows[12501:12516] + lift, atol=2e-3)
-
-
-def test_a_joint_is_a_combination_of_vertices_on_every_body():
-    """Weights that give joints of the mean and their change by every beta are told of a body of known joints."""
-    rng = np.random.default_rng(2)
-    vertices, shapes = rng.normal(size=(400, 3)), rng.normal(size=(3, 400, 3))
-    true = rng.dirichlet(np.ones(400), size=5)
-    found = make_model.joint_regressor(vertices, shapes, true @ vertices, np.einsum("jn,knd->kjd", true, shapes))
-    body = vertices + np.tensordot(rng.normal(size=3), shapes, axes=1)
-    np.testing.assert_allclose(found.sum(axis=1), 1, atol=1e-12)
-    np.testing.assert_allclose(found @ vertices, true @ vertices, atol=1e-9)
-    np.testing.assert_allclose(found @ body, true @ body, atol=1e-9)
-
-
-def test_landmarks_of_a_scan_are_matched_by_name(model, tmp_path):
-    marks = tmp_path / "marks.json"
-    marks.write_text('{"navel": [0, 1, 2], "left heel": [3, 4, 5], "right heel": [6, 7, 8], "other": [0, 0, 0]}')
-    vertices, points = read_landmark_pairs(model, "m", marks, None, "m")
-    found = dict(zip(vertices.tolist(), points.tolist(), strict=True))
-    assert found == {model.info["landmarks"][n]: p for n, p in
-                     (("navel", [0, 1, 2]), ("left heel", [3, 4, 5]), ("right heel", [6, 7, 8]))}
-    marks.write_text('{"navel": [0, 1, 2]}')
-    with pytest.warns(UserWarning, match=r"marks\.json.*template: .*left heel.*scan: navel; going on without"):
-        assert read_landmark_pairs(model, "m", marks, None, "m") is None

@@ -67,28 +67,6 @@ def test_sums_sizes_and_types(model):
         assert one.products.count == one.count
 
 
-@WORMS
-def test_points_of_free_shape(model):
-    """Some points, and all of them with others after them, are those of the stitched body."""
-    betas, pose = np.array([0.7, -1.2, 0.4]), np.random.default_rng(0).normal(0, 0.5, (4, 3))
-    ids = np.array([17, 3, 250])
-    other, whole = model.points(ids), model.everywhere
-    both = whole.concatenate(other).operator(betas).relative_positions(pose)
-    np.testing.assert_allclose(both[:, :whole.count], whole.operator(betas).relative_positions(pose), rtol=0,
-                               atol=1e-12)
-    np.testing.assert_allclose(both[:, whole.count:], both[:, ids], rtol=0, atol=1e-12)
-    np.testing.assert_allclose(both[:, whole.count:].T, model.vertices_of(pose, betas)[ids], rtol=0, atol=1e-12)
-    assert whole.combine(np.zeros((0, whole.count))).operator(betas).relative_positions(pose).shape == (3, 0)
-    mixed = np.random.default_rng(1).dirichlet(np.ones(whole.count), 2)
-    np.testing.assert_allclose(whole.combine(mixed).operator(betas).relative_positions(pose),
-                               both[:, :whole.count] @ mixed.T,
-                               rtol=0, atol=1e-12)
-    turned = whole.along(np.eye(3)[[2, 0]]).operator(np.array([0.5, 1.0]))
-    np.testing.assert_allclose(turned.relative_positions(pose),
-                               whole.operator(np.array([1.0, 0, 0.5])).relative_positions(pose), rtol=0,
-                               atol=1e-12)
-
-
 def test_parts_without_an_inside():
     """A cube of four parts of three triangles each: every vertex is on a border."""
     corners = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)], dtype=float)

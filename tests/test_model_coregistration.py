@@ -9,20 +9,11 @@ from derivatives import differences
 from jointed_bodies import bent
 from model_bodies import random_poses, worm_model
 
-from model import coregister, learn_scape, register_with_model
-from model.bilinear import PosedPoints
-from model.coregistration.single import apart
+from model import learn_scape, register_with_model
 from model.fitting.bodies import ResizedBody, as_body
-from model.fitting.rounds import meet_vertices
-from model.fitting.scan import prepare_scan
-from model.fitting.scan_fit import scan_fit
-from model.priors import typical_poses, whitening
-from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.surface import Surface
-from scanprep.geometry.target import target_of
 from scanprep.registration.nonrigid import register
 
-NOTHING = np.zeros(0, dtype=np.int64), np.zeros((0, 3))
 NEAR = np.array([0, 0.1, 0.05]), np.array([0.1, 0.0, -0.15])
 
 
@@ -94,34 +85,6 @@ def test_betas_are_found_with_the_pose():
     assert mean_mm(found.mesh.vertices, truth) < 5
 
 
-def test_what_faces_away_does_not_explain(body):
-    target = target_of(body)
-    turned = replace(target, normals=-target.normals)
-    assert apart(body, target, 0.05).max() < 1e-6 and (apart(body, turned, 0.05) == 0.05).all()
-
-
-@pytest.mark.parametrize("known", [True, False], ids=["subject", "betas"])
-def test_derivatives_agree_with_finite_differences(known):
-    worm = worm_model()
-    body = worm.subject([1.0, 0, 0]) if known else worm
-    points = PosedPoints(body.points(np.array([3, 50, 200, 390])))
-    x = np.random.default_rng(2).normal(0, 0.4, points.n_unknowns)
-    y, columns = points.columns(x)
-    np.testing.assert_allclose(y, points.positions(x), atol=1e-12)
-    np.testing.assert_allclose(np.swapaxes(columns, 0, 2), differences(points.positions, x), atol=1e-7)
-
-
-def test_vertices_without_weight_do_not_count(body, crab_model):
-    free = replace(QUICK.fit, prior_weight=1e-9)
-    fit = scan_fit(as_body(crab_model.subject()), prepare_scan(body), *NOTHING, free)
-    pose = np.array([[0.1, 0, 0.2], [0, 0.5, 0.1], [0.1, -0.4, 0]])
-    vertices = np.asarray(crab_model.subject().vertices(pose, np.array([0.1, 0, 0])))
-    wrong = body.vertices[:, 1] > 0.02
-    x = meet_vertices(fit, np.zeros(12), vertices + 0.3 * wrong[:, None], (~wrong).astype(float))
-    np.testing.assert_allclose(fit.body.split(x)[0], pose, atol=2e-3)
-    np.testing.assert_allclose(fit.body.split(x)[1], [0.1, 0, 0], atol=1e-3)
-
-
 @pytest.mark.parametrize("known", [True, False], ids=["subject", "betas"])
 def test_a_body_of_another_size_has_the_same_pose_and_betas(known):
     """Points times a factor about where the root stands; derivatives agree with finite differences."""
@@ -140,15 +103,6 @@ def test_a_body_of_another_size_has_the_same_pose_and_betas(known):
     np.testing.assert_allclose(person.vertices(own), factor * large.vertices(x), atol=1e-6)
 
 
-def test_prior_is_the_shrunk_gaussian(crab_model):
-    W = whitening(crab_model.pose_covariance)
-    assert not W[:, :3].any() and np.linalg.matrix_rank(W) == 6
-    poses = typical_poses(crab_model.pose_mean, crab_model.pose_covariance, 2)
-    assert poses.shape == (5, 3, 3)
-    np.testing.assert_allclose(poses[1] + poses[3], 2 * crab_model.pose_mean, atol=1e-12)
-    assert np.trace(crab_model.pose_covariance) * 1.5**2 > np.sum((poses[1] - poses[0]) ** 2) > 0
-
-
 @pytest.mark.parametrize("given, words", [
     ({"start": np.zeros((4, 3))}, "start: expected"),
     ({"landmarks": (np.array([5000]), np.zeros((1, 3)))}, "0..821"),
@@ -157,13 +111,3 @@ def test_prior_is_the_shrunk_gaussian(crab_model):
 def test_one_scan_refuses_what_it_cannot_use(body, crab_model, given, words):
     with pytest.raises(ValueError, match=words):
         register_with_model(crab_model.subject(), body, config=QUICK, **given)
-
-
-@pytest.mark.slow
-def test_rounds_refuse_what_they_cannot_use(body, crab_model):
-    with pytest.raises(ValueError, match="subjects: expected 2"):
-        coregister(crab_model, [body, body], subjects=["a"])
-    strict = replace(QUICK, rounds=1)
-    elsewhere = Mesh(np.random.default_rng(0).normal(0, 0.4, (3000, 3)), np.zeros((0, 3), dtype=np.int64))
-    with pytest.raises(ValueError, match="only 0 of 2"):
-        coregister(crab_model, [elsewhere.vertices, elsewhere.vertices], None, strict)

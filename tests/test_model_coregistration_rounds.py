@@ -2,7 +2,6 @@
 import csv
 import json
 import os
-import shutil
 import signal
 import subprocess
 import sys
@@ -22,7 +21,6 @@ from trees import tree
 import model.coregistration.rounds as rounds_module
 from model import ModelRegistration, coregister, learn_scape, load_model
 from scanprep import RegisteredSet, write_mesh
-from scanprep.batch.digests import Digests
 from scanprep.batch.opening import workspace
 from scanprep.batch.workspace import HOME
 from scanprep.geometry.landmarks import write_landmarks
@@ -49,7 +47,7 @@ def test_the_person_with_most_scans_teaches_poses_and_others_shapes(monkeypatch)
     monkeypatch.setattr(rounds_module, "register_with_model", ready)
     done = coregister(worm, bodies, None, replace(COARSE, rounds=1), subjects=who)
     assert done.model.info["poses"] == 1 + 3 and done.model.info["shapes"] == 3      # the template; not the one failed
-    assert done.good.tolist() == [True] * 6 + [False, True] and done.history[0].failed == 1
+    assert done.good.tolist() == [True] * 6 + [False, True] and done.failed[0] == 1
     assert done.model.n_betas == 2
 
 
@@ -82,17 +80,17 @@ def test_rounds_mend_what_failed_and_better_the_model(story, body):
     # those that failed end at 5.6 to 6.9 mm by the noise of their scans (four draws), and once at 126 in earlier code
     assert (after[:3] < 3).all() and (after[3:] < 8).all()
     assert after[:3].mean() < before[:3].mean() + 0.5
-    assert done.rounds == 2 and done.history[0].failed <= 1 and done.history[1].failed == 0     # 2 had failed without
-    assert np.isnan(done.history[0].change) and done.history[1].change < 3e-3
+    assert done.rounds == 2 and done.failed[0] <= 1 and done.failed[1] == 0     # 2 had failed without
+    assert np.isnan(done.changes[0]) and done.changes[1] < 3e-3
     assert done.model.info["poses"] == 6 and not done.failures
 
 
 @pytest.mark.slow
 def test_a_settled_folder_stops_early_and_reports_it(story):
     _, scans, _, _, done, _ = story
-    again = coregister(done.model, scans[:2], None, replace(COARSE, tolerance=0.02, rounds=4),
+    again = coregister(done.model, scans[:2], None, replace(COARSE, rounds=4),
                        [r.mesh.vertices for r in done.registrations[:2]])
-    assert again.converged and again.rounds == 2
+    assert again.converged and again.rounds == 3
 
 
 @pytest.fixture
@@ -102,35 +100,10 @@ def asked(monkeypatch):
 
     def ready(body, scan, marks, start, config):
         calls.append(scan)
-        return made_of(body.template, np.asarray(start) + 1e-4 * scan[:1])
+        return made_of(body.template, np.asarray(start) + 0.1 * scan[:1])
 
     monkeypatch.setattr(rounds_module, "register_with_model", ready)
     return calls
-
-
-@pytest.mark.slow
-def test_what_was_kept_is_not_made_again(story, tmp_path, monkeypatch):
-    _, scans, plain, first, done, kept = story
-    shutil.copytree(kept, tmp_path / "kept")
-
-    def forbidden(*args, **kwargs):
-        raise AssertionError("made again")
-
-    monkeypatch.setattr(rounds_module, "register_with_model", forbidden)
-    monkeypatch.setattr(rounds_module, "learn_again", forbidden)
-    with workspace(tmp_path / "kept") as space:
-        again = coregister(first, scans, None, COARSE, list(plain), space=space)
-    for a, b in zip(again.registrations, done.registrations, strict=True):
-        np.testing.assert_array_equal(a.mesh.vertices, b.mesh.vertices)
-        np.testing.assert_array_equal(a.distances, b.distances)
-        assert (a.explained, a.inverted, a.betas) == (b.explained, b.inverted, None)
-    pose = done.registrations[4].pose
-    np.testing.assert_array_equal(again.model.vertices(pose), done.model.vertices(pose))
-    assert digests_of(again.model) == digests_of(done.model)
-
-
-def digests_of(value):
-    return Digests().of(value)
 
 
 CHANGES = {          # what is changed -> scans that are made anew in the first round, and how many after it
@@ -143,7 +116,7 @@ CHANGES = {          # what is changed -> scans that are made anew in the first 
 @pytest.mark.parametrize("what", CHANGES)
 def test_only_what_depends_on_a_change_is_made_anew(story, asked, tmp_path, what):
     _, scans, plain, first, _, _ = story
-    scans, starts, marks, model, config = list(scans), list(plain), [None] * 5, first, replace(QUICK, tolerance=0)
+    scans, starts, marks, model, config = list(scans), list(plain), [None] * 5, first, QUICK
     with workspace(tmp_path / "kept") as space:
         before = coregister(model, scans, marks, config, starts, space=space)
         assert len(asked) == 10
@@ -179,7 +152,7 @@ def test_a_scan_that_cannot_be_registered_stops_no_other(story):
     done = coregister(first, spoilt, None, replace(QUICK, rounds=1), starts, names=["a", "b", "c"])
     assert list(done.failures) == ["c"] and "c" in done.failures["c"]
     assert done.good.tolist() == [True, True, False] and done.registrations[2] is None
-    assert done.history[0].failed == 1
+    assert done.failed[0] == 1
     with pytest.raises(ValueError, match=r"only 0 of 2.*scan 0: "):
         coregister(first, spoilt[2:] * 2, None, replace(QUICK, rounds=1))
 

@@ -9,7 +9,6 @@ from exported_worms import worm, worm_motion, worm_rig  # noqa: F401 -- fixtures
 from model.export.bvh import part_ends, write_bvh
 from model.motion.bvh import read_bvh
 from model.rig import joint_places, turn_up
-from scanprep.geometry import rotations
 from scanprep.geometry.storage import StorageError
 
 
@@ -56,26 +55,6 @@ Frame Time:\t0.05
 30\t10 20  0 0 0  -70  4.5 0 0 0 0  0.5 0 0
 30 10 20  0 0 0  0  4 0 0 0 0  0 0 0
 """
-
-
-@pytest.mark.parametrize("end", ["\n", "\r\n"])
-def test_bvh_of_other_programs(tmp_path, end):
-    (tmp_path / "a.bvh").write_bytes(("\ufeff" + MIXED.replace("60 70", "60\n70").replace("\n", end)).encode())
-    bvh = read_bvh(tmp_path / "a.bvh", "cm")
-    assert bvh.names == ("Left Hip", "a", "b", "c") and bvh.parents.tolist() == [-1, 0, 0, 0] and bvh.rate == 20
-
-    def about(axis, degrees):
-        return rotations.exp(np.radians(degrees) * np.eye(3)[axis])
-
-    root = about(1, 40) @ about(0, 50) @ about(2, 60)
-    turned = [root, root @ about(0, 70), root @ about(2, 80) @ about(1, 90), root]
-    assert np.abs(bvh.rotations[0] - turned).max() < 1e-12
-    assert np.abs(bvh.rotations[1, 1] - about(0, -70)).max() < 1e-12
-    # b writes its offset itself, c the change of it; the root's place has its offset in it
-    steps = np.array([[0, 10, 0], [4.5, 0, 0], [4.5, 0, 0]]) / 100
-    start = np.array([10, 20, 30]) / 100
-    assert np.abs(bvh.places[0] - np.vstack([start, start + steps @ root.T])).max() < 1e-12
-    assert np.array_equal(bvh.ends[1], [0, 0.01, 0])
 
 
 @pytest.mark.parametrize(("change", "words"), [

@@ -8,16 +8,14 @@ from bvh_reader import Bvh
 from conformance_bodies import blendscape_worm, scape_worm, skinned_worm
 from exported_worms import BETAS, worm, worm_motion, worm_rig  # noqa: F401 -- fixtures
 from glb_reader import Glb
-from model_bodies import random_poses, worm_model
 
-from model.export.cli import WRITERS, Writer, export, read_motion, write_frames
-from model.export.correctives import motion_correctives, pose_directions, pose_features, write_body_npz
+from model.export.cli import export, read_motion
+from model.export.correctives import motion_correctives, write_body_npz
 from model.export.glb import continuous_quaternions, encode_skinned_glb, write_skinned_glb
 from model.motion.onto import BodyMotion
 from model.rig import turn_up
 from model.shape_space import ShapeSpace
 from scanprep.command_line import run
-from scanprep.console import Metric
 from scanprep.geometry import rotations
 from scanprep.geometry.files import read_mesh
 from scanprep.geometry.mesh import Mesh
@@ -149,35 +147,6 @@ def test_npz_has_the_arrays_that_users_expect(model, tmp_path):
         assert np.abs(body(arrays, pose, betas, trans) - model.vertices(pose, betas, trans)).max() < 1e-6
 
 
-def test_pose_directions_bring_skinning_to_the_model(tmp_path):
-    model = worm_model()
-    object.__setattr__(model, "pose_covariance", 0.15 * np.diag([0, 0, 0] + [1] * 9))
-    arrays = write_body_npz(tmp_path / "a.npz", model)
-    without = {**arrays, "posedirs": np.zeros_like(arrays["posedirs"])}
-    poses = random_poses(model, 10, np.random.default_rng(7), 0.35)
-    poses[:, 0] = 0
-    error = [np.mean([np.linalg.norm(body(a, p, np.zeros(3), 0) - model.vertices(p, np.zeros(3)), axis=1).mean()
-                      for p in poses]) for a in (without, arrays)]
-    assert error[1] < 0.35 * error[0]
-
-
-def test_known_pose_directions_are_found(model, rig):
-    poses = random_poses(model, 120, np.random.default_rng(8), 0.4)
-    known = np.random.default_rng(9).normal(0, 0.01, (*rig.mesh.vertices.shape, 27))
-    changes = np.tensordot(pose_features(poses), known, axes=(1, 2))
-    found = pose_directions(rig, poses, rig.vertices(poses, changes=changes))
-    off = np.tensordot(pose_features(poses), found - known, axes=(1, 2))
-    assert np.abs(off).mean() < 0.03 * np.abs(changes).mean(), "but for the ridge"
-
-
-def test_a_motion_becomes_a_folder_of_meshes(model, motion, tmp_path):
-    subject, calls = model.subject(BETAS), []
-    paths = write_frames(tmp_path / "frames", subject, *motion, progress=lambda *now: calls.append(now))
-    assert [p.name for p in paths] == [f"{t:05d}.ply" for t in range(5)] and calls[-1] == (5, 5)
-    for t, path in enumerate(paths):
-        assert np.abs(read_mesh(path, "m").vertices - subject.vertices(motion[0][t], motion[1][t])).max() < 1e-6
-
-
 @pytest.fixture(scope="module")
 def files(model, motion, tmp_path_factory):
     folder = tmp_path_factory.mktemp("export")
@@ -235,17 +204,6 @@ def test_the_command_refuses_in_one_line(files, arguments, code, words, capsys, 
     assert run(export, "scape model export", ["model.npz", *arguments]) == code
     assert words in capsys.readouterr().err
     assert not list(files.glob("b.*")) and not (files / "nothing").exists()
-
-
-def test_a_new_kind_of_file_is_one_line_of_the_table(files, monkeypatch):
-    """Joints at rest as text: a writer that gets what was asked for, and says what it wrote."""
-    def write_joints(order):
-        np.savetxt(order.output, order.model.subject(order.person).joints(np.zeros((4, 3))))
-        return [Metric("joints", len(order.model.skeleton.parents))]
-
-    monkeypatch.setitem(WRITERS, ".joints.txt", Writer("joint list", {"betas"}, write_joints))
-    assert exported(files, "a.joints.txt", "--betas", "1") == {"joints": 4}
-    assert np.loadtxt(files / "a.joints.txt").shape == (4, 3)
 
 
 @pytest.mark.parametrize("rate", [24.0, 30.0, 48.0, 120.0])

@@ -4,22 +4,17 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from completion_bodies import worm_with_prior
 from jointed_bodies import bent, crab
 from scan_folders import QUICK, ball
 from test_scanprep_registration_start import BEND, small
 
-from model.built_in import load_built_in_model
-from model.coregistration import lead
 from model.coregistration.lead import model_lead
-from model.fitting import search
 from scanprep import Mesh, read_mesh, write_mesh
 from scanprep.cli import group
 from scanprep.decimation.decimate import decimate
 from scanprep.geometry.rotations import exp
 from scanprep.geometry.surface import Surface
-from scanprep.registration import person
-from scanprep.registration.lead import Proposal, find_scanned_person, lead_of
+from scanprep.registration.lead import Proposal, lead_of
 from scanprep.registration.nonrigid import register
 from scanprep.registration.unmarked import Candidate, find_rival, register_by_any, weigh_doubts
 from scanprep.registration.verdict import judge_registration
@@ -126,22 +121,6 @@ def test_no_model_where_none_is_wanted_or_known(body, tmp_path):
         lead_of(body, str(tmp_path / "gone.npz"))
 
 
-def test_a_template_in_known_triangles_is_not_searched(monkeypatch):
-    """Those of the model, or those of the synthetic people, of which the built-in model keeps some vertices."""
-    monkeypatch.setattr(lead, "lay_model", lambda *given: pytest.fail("the model was sought"))
-    monkeypatch.setattr(person, "register", lambda *given: pytest.fail("a person was registered"))
-    model, template = load_built_in_model(), SyntheticPerson(BodyShape.random(np.random.default_rng(3))).mesh
-    kept = np.array(model.info["people_vertices"])
-    whole = model_lead(template, "people")
-    carried = whole.carrier.positions(template.vertices[kept])
-    np.testing.assert_allclose(carried, template.vertices, atol=1e-9)   # also those that lie beside the coarser surface
-    assert set(whole.parts.skeleton.names) == set(model.skeleton.names)
-    own = model_lead(model.template, "people")
-    np.testing.assert_allclose(own.carrier.off, 0, atol=1e-9)
-    parts = person.person_parts(template)
-    np.testing.assert_array_equal(parts.skeleton.part_of_face, person.average_person().part_of_face)
-
-
 @pytest.mark.slow
 def test_a_crab_is_no_person(body):
     with pytest.raises(ValueError, match="--through people: the model does not come to lie on the template"):
@@ -163,15 +142,3 @@ def test_a_person_is_found_in_any_pose_and_lands_on_the_scan(tmp_path):
     rows = {m["metric"]: m["value"] for m in json.loads((tmp_path / "found.ply.report.json").read_text())["metrics"]}
     assert rows["led by"] == "model people"
     assert off(read_mesh(tmp_path / "found.ply").vertices, truth) < 0.01
-
-
-@pytest.mark.slow
-def test_what_is_no_person_is_not_searched_for_limbs(monkeypatch):
-    """A template of an animal waited half a minute for limbs that it does not have; a person is found."""
-    monkeypatch.setattr(search, "_solve_with_limbs", lambda *given: pytest.fail("limbs were searched"))
-    worm = worm_with_prior().template
-    assert find_scanned_person(worm.with_vertices([1, 1.05, 0.97] * worm.vertices)) is None
-    somebody = SyntheticPerson(BodyShape.like("female", weight=0.8)).mesh
-    mesh, landmarks = find_scanned_person(somebody)
-    assert Surface(mesh).closest(somebody.vertices).distances.mean() < 0.003
-    assert len(landmarks) == len(load_built_in_model().info["landmarks"])

@@ -4,7 +4,7 @@ from model_bodies import random_poses, worm, worm_model, worm_skeleton
 
 from model import LearnConfig, learn_scape
 from model.fitting.vertices import fit_pose, fit_shape
-from model.learning.scape import estimate_pose_prior, pose_examples
+from model.learning.scape import estimate_pose_prior
 from model.pose_space import PoseSpace
 from model.scape import ScapeModel
 from scanprep.geometry.mesh import Mesh
@@ -65,22 +65,6 @@ def test_affine_people_are_learned_exactly(truth, training):
     np.testing.assert_allclose(model.vertices(np.zeros((4, 3))), truth.template.vertices, atol=1e-6)
 
 
-def test_prior_is_that_of_the_training_poses(truth, training):
-    rng = np.random.default_rng(0)
-    poses = random_poses(truth, 40, rng, 0.4)
-    poses[0] = 0
-    mean, covariance = estimate_pose_prior(truth.template, truth.skeleton,
-                                           pose_examples(truth.template, truth.skeleton, poses), len(poses))
-    np.testing.assert_allclose(mean[1:], poses[:, 1:].mean(axis=0), atol=1e-12)
-    np.testing.assert_allclose(covariance[3:, 3:], np.cov(poses[:, 1:].reshape(40, -1).T), atol=1e-12)
-    assert (covariance[:3] == 0).all() and (covariance[:, :3] == 0).all() and (mean[0] == 0).all()
-    learned = learn_scape(truth.template, training[0], None, truth.skeleton, LearnConfig(refinements=2))
-    np.testing.assert_allclose(learned.pose_mean, mean, atol=0.06)
-    # R and Q share what lies between them, so the learned turns are a little smaller than those of the truth
-    share = np.diag(learned.pose_covariance)[3:] / np.diag(covariance)[3:]
-    assert (share > 0.5).all() and (share < 1.1).all()
-
-
 def test_how_people_stand_counts_as_much_as_the_poses(truth, training, learned):
     """12 people near rest and 40 wide poses: the mean lies half-way, and the people's poses are kept as examples."""
     assert learned.pose_examples.shape == (52, 4, 3) and (learned.pose_examples[:, 0] == 0).all()
@@ -122,13 +106,6 @@ def test_a_body_of_one_part(training):
     model = learn_scape(template, training[0][:3], training[1][:4], one)
     fit = fit_pose(model.subject(), template.vertices + [1.0, 0, 0])
     assert fit.pose.shape == (1, 3) and fit.converged
-
-
-def test_progress_runs_to_its_end(truth, training):
-    seen = []
-    learn_scape(truth.template, training[0][:4], training[1][:3], truth.skeleton,
-                progress=lambda done, total: seen.append((done, total)))
-    assert seen[-1][0] == seen[-1][1] and [d for d, _ in seen] == sorted(d for d, _ in seen)
 
 
 def test_refuses_bad_input(truth, training):

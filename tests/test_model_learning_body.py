@@ -7,10 +7,7 @@ from animal_bodies import Animal, random_pose
 from model_bodies import random_poses, worm_model
 
 from completion.__main__ import main
-from model import LearnConfig, choose_skeleton, learn_body, load_built_in_model
-from model.human_poses import is_person
-from model.learning import parts
-from model.learning.parts import ChosenSkeleton, PartsSearch
+from model import LearnConfig, learn_body, load_built_in_model
 from scanprep import Skeleton, read_mesh, write_mesh
 from scanprep.cli import read_poses
 from scanprep.skeleton.joints import joint_doubts, joint_gaps
@@ -49,23 +46,6 @@ def test_python_learns_the_bytes_of_the_command(folder):
     report = json.loads((folder / "command.npz.report.json").read_text())
     assert report["judgement"]["verdict"] == learned.judgement.verdict
     assert str(len(learned.choice.skeleton.parents)) in str(learned)
-
-
-@pytest.mark.parametrize("free_error, wins", [(0.0099, False), (0.0095, True)])
-def test_free_sides_win_where_left_out_poses_gain(monkeypatch, free_error, wins):
-    """By 3% at least; the error of the others is told. A person stays alike."""
-    animal = Animal()
-    tree = animal.skeleton
-    errors = {None: 0.01, False: free_error}
-    monkeypatch.setattr(PartsSearch, "choose", lambda search, symmetric: ChosenSkeleton(
-        tree, {len(tree.parents): errors[symmetric]}, symmetric is None, np.nan))
-    monkeypatch.setattr(parts, "is_person", lambda skeleton: False)
-    chosen = choose_skeleton(animal.mesh, np.stack(3 * [animal.mesh.vertices]))
-    assert chosen.tied != wins and chosen.error == errors[False if wins else None]
-    assert chosen.other_error == errors[None if wins else False]
-    monkeypatch.setattr(parts, "is_person", lambda skeleton: True)
-    assert choose_skeleton(animal.mesh, np.stack(3 * [animal.mesh.vertices])).tied
-    assert not is_person(tree)
 
 
 def test_a_joint_that_holds_nothing_together_is_named():

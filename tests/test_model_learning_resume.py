@@ -1,5 +1,4 @@
 """`scape learn` killed, started again, and with inputs that change: nothing lost, nothing stale, nothing done twice."""
-import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -9,14 +8,13 @@ import pytest
 from config_files import config_file
 from model_bodies import random_poses, worm_model
 
-from model import load_model, report
-from model.learning import body, cli, mixing, parts, scape, skinning
+from model import report
+from model.learning import body, cli, scape
 from model.learning.cli import learn
 from model.learning.parts import ChosenSkeleton
 from scanprep import read_mesh, write_mesh
 from scanprep.batch.opening import beside
 from scanprep.command_line import run
-from scanprep.skeleton import restarts
 
 STAGES = {"skeleton": (body, "choose_skeleton"), "poses": (scape, "by_edges"), "people": (scape, "shape_gradients"),
           "components": (scape, "learn_shape_space"), "pictures": (cli, "_draw")}
@@ -84,7 +82,7 @@ def counted(monkeypatch):
 @pytest.fixture
 def searched(monkeypatch):
     """A search for a skeleton that takes no time, for words without --skeleton."""
-    chosen = ChosenSkeleton(worm_model().skeleton, {4: 0.001}, False, np.nan)
+    chosen = ChosenSkeleton(worm_model().skeleton, {4: 0.001}, False)
     monkeypatch.setattr(body, "choose_skeleton", lambda *given: chosen)
 
 
@@ -133,55 +131,6 @@ def test_killed_and_started_again_it_goes_on_and_ends_with_the_same_bytes(bodies
 
 
 @pytest.mark.slow
-def test_killed_twice_in_the_poses(bodies, monkeypatch):
-    undisturbed = learned(bodies, "a.npz", refinements=3)
-    killed(scape, "_refine", 1, words(bodies, "b.npz", refinements=3))       # after the first refinement
-    killed(scape, "_refine", 1, words(bodies, "b.npz", refinements=3))       # after the second
-    real, calls = scape._refine, []
-    monkeypatch.setattr(scape, "_refine", lambda *given, **named: calls.append(1) or real(*given, **named))
-    monkeypatch.setattr(scape, "by_edges", None)
-    assert learned(bodies, "b.npz", refinements=3) == undisturbed
-    assert len(calls) == 1
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("kind, module, name, after", [
-    ("skinning", skinning, "_with_joints", 2), ("skinning", skinning, "_unpose_person", 3),
-    ("blendscape", scape, "shape_gradients", 2)])
-def test_every_kind_goes_on(bodies, kind, module, name, after):
-    given = ["--kind", kind]
-    undisturbed = learned(bodies, "a.npz", *given)
-    killed(module, name, after, words(bodies, "b.npz", *given))
-    assert learned(bodies, "b.npz", *given) == undisturbed
-
-
-@pytest.mark.slow
-def test_the_search_for_a_skeleton_goes_on(tmp_path, monkeypatch):
-    truth = worm_model(rings=17)
-    bodies = truth.subject().vertices(random_poses(truth, 5, np.random.default_rng(0), 0.4))
-    for i, vertices in enumerate(bodies):
-        write_mesh(tmp_path / "poses" / f"pose{i}.ply", truth.template.with_vertices(vertices))
-
-    def given(name):
-        return ["--poses", str(tmp_path / "poses"), "-o", str(tmp_path / name),
-                "--config", str(config_file(tmp_path, scape=QUICK))]
-
-    compared, search = [], restarts._search
-    predict = parts.PartsSearch._predict_left_out
-    monkeypatch.setattr(parts.PartsSearch, "_predict_left_out", lambda *of: compared.append(1) or predict(*of))
-    assert run(learn, "scape learn", given("a.npz")) == 0
-    undisturbed = len(compared)
-    killed(restarts, "_search", 1, given("b.npz"))                              # after the first restart
-    killed(parts, "PartsSearch._predict_left_out", 0, given("b.npz"))           # after the last
-    killed(parts, "PartsSearch._predict_left_out", 1, given("b.npz"))           # before more parts are compared
-    monkeypatch.setattr(restarts, "_search",
-                        lambda one: pytest.fail("searched again") if one.sides.tied else search(one))
-    assert run(learn, "scape learn", given("b.npz")) == 0
-    assert (tmp_path / "a.npz").read_bytes() == (tmp_path / "b.npz").read_bytes()
-    assert len(compared) == 2 * undisturbed - 1                                 # the first was kept
-
-
-@pytest.mark.slow
 @pytest.mark.parametrize("more, done", [
     ([], {"pictures": 1}),
     (["--landmarks"], {"pictures": 1}),
@@ -212,22 +161,6 @@ def test_a_mesh_that_changes(bodies, searched, counted, file, done):
     found = learned(bodies, "m.npz", search=True)
     assert anew(counted, since) == done
     assert found == learned(bodies, "fresh.npz", search=True)
-
-
-@pytest.mark.slow
-def test_a_person_that_changes_while_learning_is_interrupted(bodies, counted):
-    killed(scape, "learn_shape_space", 0, words(bodies, "m.npz"))
-    moved(bodies / "people/person3.ply")
-    shutil.copy(bodies / "people/person0.ply", bodies / "people/another.ply")      # the same person comes twice now
-    found = learned(bodies, "m.npz")
-    assert counted["people"] == 1 and counted["poses"] == 0
-    assert found == learned(bodies, "fresh.npz")
-
-
-def test_times_tell_what_was_done_before(bodies, searched):
-    for known in (0, 3):
-        learned(bodies, "m.npz", search=True)
-        assert (bodies / "m.npz.report.json").read_text().count("done before") == known
 
 
 @pytest.mark.parametrize("step", ["skeleton", "pose space", "shape components"])
@@ -267,24 +200,3 @@ def test_a_second_run_on_one_output_leaves(bodies, capsys):
         assert run(learn, "scape learn", words(bodies, "m.npz")) == 1
     assert "another run" in capsys.readouterr().err
     learned(bodies, "m.npz")
-
-
-@pytest.mark.slow
-def test_a_mix_goes_on(tmp_path):
-    from scanprep import RegisteredSet
-    truth, rng = worm_model(), np.random.default_rng(0)
-    whole = RegisteredSet.create(tmp_path / "set", truth.template)
-    for person in range(3):
-        subject = truth.subject(rng.normal(size=3))
-        for i, vertices in enumerate(subject.vertices(random_poses(truth, 4, rng, 0.3))):
-            whole = whole.add(f"p{person}_{i}", vertices, subject=f"p{person}")
-    whole.with_skeleton(truth.skeleton)
-    file = config_file(tmp_path, mixed={"refinements": 3, "components": 2})
-    given = ["--poses", str(tmp_path / "set"), "--kind", "mixed", "--config", str(file)]
-    assert run(learn, "scape learn", [*given, "-o", str(tmp_path / "a.npz")]) == 0
-    argv = [*given, "-o", str(tmp_path / "b.npz")]
-    killed(mixing, "_learn_people", 1, argv)
-    killed(mixing, "_learn_people", 1, argv)
-    assert run(learn, "scape learn", argv) == 0
-    assert (tmp_path / "b.npz").read_bytes() == (tmp_path / "a.npz").read_bytes()
-    assert load_model(tmp_path / "b.npz").info["people"] == 3

@@ -1,27 +1,20 @@
 from dataclasses import replace
-from functools import partial
 
 import numpy as np
 import pytest
 from conformance_bodies import skinned_worm
 from model_bodies import random_poses, worm, worm_skeleton
 
-from model.blend_weights import _onto_simplex, diffuse_weights, fit_weights, strongest
+from model.blend_weights import diffuse_weights, fit_weights, strongest
 from model.fitting.vertices import fit_pose, fit_shape
-from model.learning import skinning
 from model.learning.skinning import (
     SkinConfig,
-    _with_joints,
-    _with_joints_at,
-    _with_weights,
-    corrective_features,
     learn_skinning,
 )
 from scanprep.geometry import rotations
-from scanprep.geometry.mesh import Mesh
 from scanprep.skeleton.tree import Skeleton
 
-NARROW = {"width": 0.08, "rounds": 4}
+FEW = {"rounds": 4}
 
 
 @pytest.fixture(scope="module")
@@ -41,37 +34,18 @@ def training(truth):
 
 @pytest.fixture(scope="module")
 def learned(truth, training):
-    config = SkinConfig(components=5, **NARROW)
+    config = SkinConfig(components=5, **FEW)
     return learn_skinning(truth.template, *training, truth.skeleton, config)
 
 
 def test_new_poses_of_the_truth_are_met(truth, training, learned):
     """Data a skinning model made come back, best with the correctives they were made with."""
     bodies = truth.subject().vertices(random_poses(truth, 6, np.random.default_rng(1), 0.4))
-    plain = learn_skinning(truth.template, training[0], None, truth.skeleton, SkinConfig(correctives=False, **NARROW))
+    plain = learn_skinning(truth.template, training[0], None, truth.skeleton, SkinConfig(correctives=False, **FEW))
     linear, none = (np.mean([fit_pose(m.subject(), y).mean for y in bodies]) for m in (learned, plain))
     assert linear < 2.2e-3
     assert linear < 0.6 * none
     assert learned.info["left_out_error"] < plain.info["left_out_error"]
-
-
-def test_weights_and_joints_are_recovered(monkeypatch):
-    """From wrong ones, where the poses, the rest vertices and all else are known."""
-    truth = skinned_worm(False)
-    poses = random_poses(truth, 20, np.random.default_rng(2), 0.6)
-    bodies = truth.subject().vertices(poses)
-    off = truth.skeleton.joints + [[0, 0, 0], [0.03, 0, 0.01], [-0.03, 0.01, 0], [0.02, 0, 0]]
-    found = _with_joints_at(truth, off)
-    np.testing.assert_allclose(found.joint_regressor @ found.rest, off, atol=1e-9)
-    for _ in range(3):
-        found = _with_joints(found, poses, bodies)
-    np.testing.assert_allclose(found.joint_regressor @ found.rest, truth.skeleton.joints, atol=1e-5)
-    monkeypatch.setattr(skinning, "fit_weights", partial(fit_weights, smoothness=0.0))
-    wide = replace(truth, weights=diffuse_weights(truth.template, truth.skeleton, 0.12))
-    assert np.abs(wide.weights - truth.weights).max() > 0.03
-    for _ in range(8):
-        wide = _with_weights(wide, poses, bodies, truth.weights > 0, SkinConfig())
-    np.testing.assert_allclose(wide.weights, truth.weights, atol=2e-3)
 
 
 def test_new_people_of_the_truth_are_met(truth, learned):
@@ -121,19 +95,6 @@ def test_neighbours_draw_weights_together():
     assert flat < 0.01 * rough < rough and even < 0.7 * rough
 
 
-def test_nearest_point_of_the_simplex():
-    rng = np.random.default_rng(7)
-    v, free = rng.normal(0, 2, (50, 5)), rng.random((50, 5)) < 0.7
-    free[:, 0] = True
-    w = _onto_simplex(v, free)
-    np.testing.assert_allclose(w.sum(axis=1), 1, atol=1e-12)
-    assert (w >= 0).all() and (w[~free] == 0).all()
-    others = np.where(free[:, None], rng.dirichlet(np.ones(5), (50, 200)), 0)
-    others /= np.maximum(others.sum(axis=2, keepdims=True), 1e-12)
-    assert (np.linalg.norm(w - v, axis=1)[:, None] <= np.linalg.norm(others - v[:, None], axis=2) + 1e-12).all()
-    np.testing.assert_allclose(_onto_simplex(w, free), w, atol=1e-12)
-
-
 def test_few_weights_are_kept():
     w = np.array([[0.5, 0.3, 0.15, 0.0495, 0.0005], [1, 0, 0, 0, 0]])
     np.testing.assert_allclose(strongest(w, 2, 1e-3), [[0.625, 0.375, 0, 0, 0], [1, 0, 0, 0, 0]])
@@ -151,27 +112,9 @@ def test_weights_pass_over_the_width_asked_for():
         assert 0.5 * width < soft.max() < 3 * width
 
 
-@pytest.mark.parametrize("correctives", [False, True])
-def test_features_are_functions_of_the_kept_directions(correctives):
-    """Every feature vanishes at rest, and kept directions are all there, whatever they are."""
-    skeleton, rng = worm_skeleton(worm()), np.random.default_rng(8)
-    axes = rotations.exp(rng.normal(size=(4, 3)))[..., :2]                    # two directions a joint
-    poses = (axes @ rng.normal(0, 0.5, (30, 4, 2, 1)))[..., 0]
-    features = corrective_features(skeleton, poses, correctives)
-    free = features.constant == 0
-    assert free.sum() == 6 * correctives
-    np.testing.assert_allclose(features.evaluate(np.zeros((4, 3)))[free], 0, atol=1e-15)
-    if correctives:
-        delta = features.evaluate(poses)
-        for j in (1, 2, 3):
-            wanted = poses[:, j] @ axes[j]
-            mine = delta[:, features.of_part(j)][:, 1:]
-            assert np.abs(wanted - mine @ np.linalg.lstsq(mine, wanted, rcond=None)[0]).max() < 1e-12
-
-
 def test_rigid_motion_of_the_data_changes_nothing_within(truth, training):
     rng = np.random.default_rng(9)
-    bodies, config = training[0][:12], SkinConfig(width=0.08, rounds=1)
+    bodies, config = training[0][:12], SkinConfig(rounds=1)
     R = rotations.exp(rng.normal(size=(12, 3)))
     moved = bodies @ np.swapaxes(R, -1, -2) + rng.normal(size=(12, 1, 3))
     a, b = (learn_skinning(truth.template, y, None, truth.skeleton, config) for y in (bodies, moved))
@@ -180,17 +123,11 @@ def test_rigid_motion_of_the_data_changes_nothing_within(truth, training):
 
 
 def test_same_input_gives_the_same_bytes(truth, training):
-    config = SkinConfig(width=0.08, rounds=1)
+    config = SkinConfig(rounds=1)
     a, b = (learn_skinning(truth.template, training[0][:8], training[1][:4], truth.skeleton, config) for _ in range(2))
     for name in ("rest", "weights", "correctives", "shape_mean", "shape_components", "pose_covariance"):
         np.testing.assert_array_equal(getattr(a, name), getattr(b, name))
     assert a.info == b.info and len(a.info["digest"]) == 64
-
-
-def test_betas_of_the_training_people_have_unit_variance(learned, training):
-    found = np.stack([fit_shape(learned, y).betas for y in training[1]])
-    np.testing.assert_allclose(found[:, :3].mean(axis=0), 0, atol=0.05)
-    np.testing.assert_allclose(found[:, :3].std(axis=0), 1, atol=0.05)
 
 
 def test_a_body_of_one_part(training):
@@ -199,31 +136,6 @@ def test_a_body_of_one_part(training):
     model = learn_skinning(template, training[0][:3], training[1][:4], one, SkinConfig(rounds=1))
     fit = fit_pose(model.subject(), model.rest + [1.0, 0, 0])
     assert fit.pose.shape == (1, 3) and fit.rms < 1e-6
-
-
-def test_progress_runs_to_its_end(truth, training):
-    seen = []
-    learn_skinning(truth.template, training[0][:5], training[1][:3], truth.skeleton,
-                   SkinConfig(width=0.08, rounds=2), lambda done, total: seen.append((done, total)))
-    assert seen[-1][0] == seen[-1][1] and [d for d, _ in seen] == sorted(d for d, _ in seen)
-
-
-def test_refuses_bad_input(truth, training):
-    poses, people = training
-    template, skeleton = truth.template, truth.skeleton
-    broken = poses[:3].copy()
-    broken[1, 5, 0] = np.nan
-    for bad, word in ((poses[:1], "at least 2"), (poses[:, :-1], "expected shape"), (broken, "body 1")):
-        with pytest.raises(ValueError, match=f"poses.*{word}"):
-            learn_skinning(template, bad, None, skeleton)
-        with pytest.raises(ValueError, match=f"shapes.*{word}"):
-            learn_skinning(template, poses, bad, skeleton)
-    with pytest.raises(ValueError, match=r"skeleton.*faces"):
-        learn_skinning(template, poses, people, worm_skeleton(worm(rings=20)))
-    double = Mesh(np.vstack([template.vertices, template.vertices + 5]),
-                  np.vstack([template.faces, template.faces + len(template.vertices)]))
-    with pytest.raises(ValueError, match="components"):
-        learn_skinning(double, poses, None, skeleton)
 
 
 def test_refuses_weights_that_do_not_sum_to_one(truth):

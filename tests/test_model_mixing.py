@@ -101,14 +101,6 @@ def test_what_people_have_of_their_own_is_no_matter():
     np.testing.assert_allclose(left[~kept], (within(y) - X @ again)[~kept], atol=1e-6)
 
 
-def test_progress_runs_to_its_end(truth):
-    bodies, who, _ = mix(truth, 4, 2, 8)
-    seen = []
-    learn_scape_mix(truth.template, bodies, who, truth.skeleton, replace(FASTER, refinements=2),
-                    lambda done, total: seen.append((done, total)))
-    assert seen[-1][0] == seen[-1][1] and [d for d, _ in seen] == sorted(d for d, _ in seen)
-
-
 def test_refuses_bad_input(truth):
     bodies, who, _ = mix(truth, 3, 2, 9)
     with pytest.raises(ValueError, match=r"subjects.*6 labels.*got 5"):

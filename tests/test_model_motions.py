@@ -14,7 +14,6 @@ from model.motion.bvh import read_bvh
 from model.motion.error import measure_error
 from model.motion.onto import read_motion, standing_rest
 from model.motion.retarget import Pairing
-from model.motion.trunks import nearest_starts
 from model.rig import joint_places, make_rig
 from model.statue.control.files import humanoid
 from model.statue.files import body_model
@@ -110,13 +109,6 @@ def test_a_bvh_that_is_cut_in_half_names_its_line(tmp_path):
         path.write_text(text[:int(share * len(text))])
         with pytest.raises(StorageError, match=r"theirs\.bvh.*(line|frames)"):
             read_motion(path, small_people())
-
-
-def test_joints_of_a_trunk_are_shared_out_by_height():
-    assert nearest_starts(np.array([0.1, 0.5]), np.array([0, 0.2, 0.55, 0.9])) == [0, 2]
-    assert nearest_starts(np.array([0.0, 0.9, 0.95]), np.array([0, 0.1, 0.2])) == [0, 1, 2]
-    assert nearest_starts(np.array([0.0, 0.0, 0.0]), np.arange(5) / 4) == [0, 1, 2]
-    assert nearest_starts(np.array([0.0]), np.arange(5) / 4) == [0]
 
 
 @pytest.mark.parametrize("joints", [1, 2, 3, 6])

@@ -11,10 +11,9 @@ from completion.__main__ import main
 from model.export.bvh import write_bvh
 from model.motion.error import measure_twist
 from model.motion.onto import read_motion
-from model.motion.twist import axial, find_hinges, find_roll
+from model.motion.twist import axial
 from model.rig import make_rig
 from scanprep.geometry import rotations
-from scanprep.skeleton.roles import find_numbered_roles
 from scanprep.synthetic.people import synthesise_walk
 
 FRONT = np.array([0.0, -1, 0])
@@ -131,49 +130,6 @@ def test_the_verdict_of_a_copied_motion_tells_a_twisted_arm(tmp_path):
     assert exported["verdict"] == "check" and "is the left upper arm twisted?" in exported["reasons"][0]
     assert verdicts["rolled"]["judgement"] == "good"
     assert "left upper arm -14" in verdicts["rolled"]["bones rolled otherwise at rest, allowed for"]
-
-
-def test_a_roll_is_found_from_bent_frames_only_and_carried_between_them():
-    bend, allowed = np.array([0.05, 1, 0.1, 0.1, 1, 0.05]), np.full(6, 0.4)
-    within = np.array([3, 0.3, 3, 3, -0.3, 3.0])
-    constant, changing = find_roll(within, bend, allowed)
-    assert constant == 0 and not changing.any(), "what the hinge allows is no error; straight frames do not count"
-    constant, changing = find_roll(np.array([0, 2.9, 0, 0, -2.9, 0.0]), bend, allowed)
-    assert abs(constant) == pytest.approx(np.pi) and not changing.any(), "a half turn from both sides"
-    constant, changing = find_roll(np.array([0, 0.9, 0, 0, -0.9, 0.0]), bend, allowed)
-    assert constant == pytest.approx(0, abs=1e-9)
-    assert changing == pytest.approx([0.9, 0.9, 0.3, -0.3, -0.9, -0.9])
-    outlier = np.zeros(20)
-    outlier[7] = 3.0
-    assert find_roll(outlier, np.ones(20), np.full(20, 0.4))[1].max() == 0, "one frame is noise"
-    assert find_roll(within, np.full(6, 0.1), allowed)[0] == 0, "no hinge is bent: the motion's own roll is kept"
-
-
-def test_the_angle_of_a_hinge_undoes_a_twist():
-    skeleton = make_rig(small_people(), np.zeros(1)).skeleton
-    roles, poses = find_numbered_roles(skeleton.names, skeleton.joints), np.zeros((4, 16, 3))
-    elbow = skeleton.names.index("forearm_left")
-    bone = limb_bones(skeleton)["upper_arm_left"]
-    axis = np.cross(bone, FRONT)
-    poses[:, elbow] = np.linspace(0.5, 1.5, 4)[:, None] * axis / np.linalg.norm(axis)
-    places = make_rig(small_people(), np.zeros(1)).skeleton
-    R = places.part_rotations(poses)
-    joints = np.tile(skeleton.joints, (4, 1, 1))
-    hand = skeleton.names.index("hand_left")
-    joints[:, hand] = joints[:, elbow] + R[:, elbow] @ (skeleton.joints[hand] - skeleton.joints[elbow])
-    hinge = next(h for h in find_hinges(skeleton.joints, roles, FRONT, joints, roles) if h.parts[1] == elbow)
-    assert np.abs(hinge.angles(R[:, hinge.parts[0]], 0)).max() < np.radians(3)
-    turned = R[:, hinge.parts[0]] @ rotations.exp(0.7 * bone)
-    assert hinge.angles(turned, 0) - hinge.angles(R[:, hinge.parts[0]], 0) == pytest.approx(-0.7)
-    bends = replace(hinge, bend=np.radians([20.0, 90.0]))
-    assert np.degrees(bends.tolerance(0)) == pytest.approx([12 + 37.4, 24], abs=0.1)
-
-
-def test_the_twist_of_a_rotation_leaves_its_swing_out():
-    bone, swing = np.array([0.6, 0, -0.8]), np.array([0.8, 0.3, 0.6]) * 1.1
-    for angle in (-2.5, 0.0, 0.4, 3.0):
-        R = rotations.exp(swing) @ rotations.exp(angle * bone)
-        assert axial(R[None], bone)[0] == pytest.approx(angle)
 
 
 def test_no_twist_of_what_is_no_person():

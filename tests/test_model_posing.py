@@ -3,74 +3,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from derivatives import differences
-from model_bodies import random_poses, worm, worm_model, worm_skeleton
-from posing_bodies import skinned, symmetric_worm
+from model_bodies import random_poses, worm_model
+from posing_bodies import symmetric_worm
 
-from model.posing.poses import find_mirror, mirror_pose, pose_from_angles, rotate_joint
+from model.posing.poses import pose_from_angles
 from model.priors import JointLimits, sample_poses
 from scanprep.geometry import rotations
-from scanprep.skeleton.tree import Skeleton
-
-
-@pytest.fixture(scope="module")
-def body():
-    return symmetric_worm()
-
-
-def test_the_plane_and_the_partners_are_found(body):
-    template, skeleton, _ = body
-    mirror = find_mirror(template, skeleton)
-    np.testing.assert_allclose(np.abs(mirror.normal), [1, 0, 0], atol=1e-6)
-    assert abs((mirror.point - [0.3, 0, 0]) @ mirror.normal) < 1e-6
-    assert mirror.partners.tolist() == [0, 2, 1, 4, 3] and mirror.distance < 1e-6
-
-
-def test_the_plane_turns_with_the_body(body):
-    template, skeleton, _ = body
-    R, t = rotations.exp([0.4, -1.0, 0.7]), np.array([3.0, -2.0, 1.0])
-    moved = Skeleton(skeleton.part_of_face, skeleton.parents, skeleton.joints @ R.T + t)
-    mirror = find_mirror(template.with_vertices(template.vertices @ R.T + t), moved)
-    np.testing.assert_allclose(np.abs(mirror.normal @ R), [1, 0, 0], atol=1e-6)
-    assert mirror.partners.tolist() == [0, 2, 1, 4, 3]
-
-
-def test_mirrored_poses_give_mirrored_bodies(body):
-    template, skeleton, swap = body
-    model, mirror = skinned(template, skeleton), find_mirror(template, skeleton)
-    rng = np.random.default_rng(0)
-    poses, trans = rng.normal(0, 0.6, (4, 5, 3)), rng.normal(size=(4, 3))
-    y = model.vertices(poses, None, trans)
-    there = model.vertices(mirror_pose(mirror, poses), None, mirror.trans(skeleton, trans))
-    np.testing.assert_allclose(there[:, swap], mirror.reflect(y), rtol=0, atol=1e-3)
-
-
-def test_mirrored_twice_is_the_identity(body):
-    template, skeleton, _ = body
-    mirror = find_mirror(template, skeleton)
-    poses = np.random.default_rng(1).normal(0, 2, (3, 5, 3))
-    np.testing.assert_allclose(mirror_pose(mirror, mirror_pose(mirror, poses)), poses, atol=1e-12)
-    R, M = skeleton.part_rotations(poses), mirror.matrix
-    np.testing.assert_allclose(skeleton.part_rotations(mirror_pose(mirror, poses)), M @ R[:, mirror.partners] @ M,
-                               atol=1e-12)
-    trans = np.array([1.0, 2.0, 3.0])
-    np.testing.assert_allclose(mirror.trans(skeleton, mirror.trans(skeleton, trans)), trans, atol=1e-12)
-
-
-def test_a_body_without_pairs_may_be_symmetric_all_the_same():
-    mirror = find_mirror(worm(), worm_skeleton(worm()))
-    assert mirror.partners.tolist() == [0, 1, 2, 3] and abs(mirror.normal[0]) < 1e-3
-
-
-def test_says_why_there_is_no_mirror(body):
-    template, skeleton, _ = body
-    far = skeleton.joints + np.where(np.arange(5)[:, None] == 4, [0, 0.5, 0.8], 0)
-    with pytest.raises(ValueError, match=r"not symmetric; in the best mirror, part '.*end' comes to lie 0\.\d+ m"):
-        find_mirror(template, Skeleton(skeleton.part_of_face, skeleton.parents, far, skeleton.names))
-    bent = template.vertices + np.where(template.vertices[:, [0]] > 0.3, [0, 0.5, 0.3], 0)
-    lone = worm_skeleton(template)
-    with pytest.raises(ValueError, match="no two parts can be exchanged"):
-        find_mirror(template.with_vertices(bent), Skeleton(lone.part_of_face, lone.parents,
-                                                           lone.joints * [1, 1, 2] + lone.joints[:, [0]] ** 2))
 
 
 def test_poses_from_angles():
@@ -83,40 +21,12 @@ def test_poses_from_angles():
 
 
 @pytest.mark.parametrize(("angles", "message"), [
-    ({"arm": [0, 0, 0]}, "no 'arm'"), ({7: [0, 0, 0]}, r"0\.\.4"), ({1: [0, 0, 0], "left": [0, 0, 0]}, "twice"),
+    ({"arm": [0, 0, 0]}, "got 'arm'"), ({7: [0, 0, 0]}, "below 5"), ({1: [0, 0, 0], "left": [0, 0, 0]}, "twice"),
     ({1: [1, 2]}, "axis-angle vector"), ({1: ("u", 30)}, "x, y or z"), ({1: ((0, 0, 0), 30)}, "no direction"),
     ({1: [0, np.nan, 0]}, "axis-angle vector")])
 def test_angles_that_are_none(angles, message):
     with pytest.raises(ValueError, match=message):
         pose_from_angles(symmetric_worm()[1], angles)
-
-
-def test_turns_about_the_axes_of_each_frame():
-    skeleton = symmetric_worm()[1]
-    poses = np.random.default_rng(0).normal(0, 0.8, (6, 5, 3))
-    w = np.array([0.3, -0.5, 0.2])
-    R = skeleton.part_rotations(poses)
-    more, above = rotations.exp(w), R[:, 2]
-    expected = {"world": more @ R[:, 4], "own": R[:, 4] @ more,
-                "parent": above @ more @ np.swapaxes(above, -1, -2) @ R[:, 4]}
-    for frame, wanted in expected.items():
-        turned = rotate_joint(skeleton, poses, "right end", w, frame)
-        np.testing.assert_allclose(skeleton.part_rotations(turned)[:, 4], wanted, atol=1e-12)
-        np.testing.assert_array_equal(np.delete(turned, 4, axis=-2), np.delete(poses, 4, axis=-2))
-    root = rotate_joint(skeleton, poses, 0, ("z", 30), "world")
-    np.testing.assert_allclose(skeleton.part_rotations(root), rotations.exp([0, 0, np.pi / 6]) @ R, atol=1e-12)
-
-
-def test_turned_there_and_back():
-    skeleton = symmetric_worm()[1]
-    pose = np.random.default_rng(0).normal(0, 0.8, (5, 3))
-    for frame in ("parent", "world", "own"):
-        there = rotate_joint(skeleton, pose, 3, ("y", 40), frame)
-        np.testing.assert_allclose(rotate_joint(skeleton, there, 3, ("y", -40), frame), pose, atol=1e-12)
-    with pytest.raises(ValueError, match="frame"):
-        rotate_joint(skeleton, pose, 3, ("y", 40), "sideways")
-    with pytest.raises(ValueError, match="pose"):
-        rotate_joint(skeleton, pose[:3], 3, ("y", 40))
 
 
 @pytest.fixture(scope="module")

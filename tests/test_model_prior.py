@@ -7,7 +7,6 @@ from model_bodies import random_poses, worm_model
 
 from completion.__main__ import main
 from model import LearnConfig, learn_blendscape, learn_scape, load_model
-from model.features import QuadraticLift, part_features
 from model.fitting.search import ModelMismatchError
 from model.fitting.vertices import fit_pose
 from model.learning.prior import TemplatePrior
@@ -129,19 +128,6 @@ def test_nobody_beside_the_prior_leaves_its_people_and_many_are_themselves():
     np.testing.assert_allclose(both.variances, own.variances, rtol=0.05)
 
 
-def test_pose_spaces_add_up(known, other):
-    poses = random_poses(known, 5, np.random.default_rng(7))
-    both = known.pose_space.add(other.pose_space)
-    np.testing.assert_allclose(both.gradients(poses), known.pose_space.gradients(poses)
-                               + other.pose_space.gradients(poses), atol=1e-5)
-    lift = QuadraticLift()
-    axes = [np.zeros((9, 0))] * 4
-    features = part_features(known.skeleton, lift, axes)
-    constant = tuple(np.zeros((1, len(f), 3, 3), np.float32) for f in known.pose_space.faces_of_part)
-    with pytest.raises(ValueError, match="linear and quadratic"):
-        known.pose_space.add(PoseSpace(features, constant))
-
-
 def test_a_prior_of_another_template_is_refused(known):
     prior = prior_of(worm_model(rings=25))
     with pytest.raises(ValueError, match="prior: it was brought to a template of 302 vertices"):
@@ -195,7 +181,7 @@ def test_a_model_of_something_else_is_refused_by_name_and_left_out_by_itself(kno
     for i, body in enumerate(known.subject().vertices(poses)):
         write_mesh(tmp_path / "poses" / f"{i:02d}.ply", known.template.with_vertices(body))
     known.skeleton.save(tmp_path / "skeleton.json")
-    words = ["learn", "--poses", str(tmp_path / "poses"), "--template", str(tmp_path / "poses" / "00.ply"),
+    words = ["learn", "--poses", str(tmp_path / "poses"),
              "--skeleton", str(tmp_path / "skeleton.json"), "-o", str(tmp_path / "m.npz")]
     assert main([*words, "--prior", "people"]) == 1
     assert "--prior people: the model does not come to lie" in capsys.readouterr().err

@@ -5,7 +5,6 @@ import pytest
 from model_bodies import random_poses, worm_model
 
 from model import LearnConfig, learn_scape
-from model.files import load_model
 from model.fitting.vertices import fit_shape
 from model.learning.sexes import guess_sex, learn_by_sex, learn_sex_plane
 from model.shape_statistics import PLANE
@@ -85,12 +84,6 @@ def test_the_neutral_model_tells_its_people_apart(truth, models):
         guess_sex(models["male"], np.zeros(2))
 
 
-def test_betas_of_the_people_are_their_projections(models, data):
-    neutral = models["neutral"]
-    S = np.stack([neutral.shape_space.gradients(b) for b in np.eye(neutral.n_betas)[:, ::-1]])
-    np.testing.assert_allclose(neutral.shape_space.betas_of(S), np.eye(neutral.n_betas)[:, ::-1], atol=1e-4)
-
-
 def test_the_plane_lies_between_two_clouds():
     """Normal along the only beta that differs, halfway; said shares and probabilities are those of new people."""
     rng = np.random.default_rng(1)
@@ -106,12 +99,6 @@ def test_the_plane_lies_between_two_clouds():
     assert abs(right.mean() - plane.accuracy) < 0.08
     sure = 1 / (1 + np.exp(-(plane.slope * np.abs(margins))))
     assert abs(sure.mean() - right.mean()) < 0.08
-
-
-def test_a_plane_is_kept_in_the_file(models, tmp_path):
-    models["neutral"].save(tmp_path / "neutral.npz")
-    betas = np.array([0.3, -0.2])
-    assert guess_sex(load_model(tmp_path / "neutral.npz"), betas) == guess_sex(models["neutral"], betas)
 
 
 def test_refuses_what_says_no_sex(models):

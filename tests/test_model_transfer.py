@@ -10,9 +10,7 @@ from model.cli import group
 from model.features import linear_features
 from model.fitting.vertices import PoseFit, ShapeFit
 from model.posing.transfer import own_body, subject_from_body
-from model.scape import BlendScapeModel
 from scanprep import read_mesh, write_mesh
-from scanprep.geometry import rotations
 
 
 @pytest.fixture(scope="module")
@@ -22,7 +20,6 @@ def model():
 
 def repose(model, body, poses, trans=None, fit=None):
     return own_body(model, body, fit).subject.vertices(poses, trans)
-
 
 
 def fit_of(pose, betas=None):
@@ -72,17 +69,6 @@ def test_detail_that_betas_do_not_have_is_kept(model):
     np.testing.assert_allclose(repose(model, body, rest, fit=fit_of(rest)), found.vertices - found.trans, atol=1e-12)
 
 
-def test_a_body_that_only_turned_is_turned_back():
-    """Rigid parts, no bulges: whatever the body looks like, stiff motions are undone exactly."""
-    model = worm_model(bulge=0.0)
-    body, R = lumpy(model), rotations.exp([0.5, 1.0, -0.3])
-    pose = np.zeros((4, 3))
-    pose[0] = rotations.log(R)
-    subject = own_body(model, body @ R.T, fit_of(pose)).subject
-    plain = own_body(model, body, fit_of(np.zeros((4, 3)))).subject
-    np.testing.assert_allclose(subject.operator.products.basis, plain.operator.products.basis, rtol=0, atol=1e-9)
-
-
 def test_the_pose_is_found(model):
     rng = np.random.default_rng(2)
     pose = random_poses(model, 1, rng, 0.2)[0]
@@ -95,32 +81,6 @@ def test_the_pose_is_found(model):
     subject = subject_from_body(model, body)
     np.testing.assert_array_equal(subject.operator.products.basis, found.subject.operator.products.basis)
     assert subject.pose_covariance is model.pose_covariance
-
-
-def test_batches_are_loops_and_trans_is_added(model):
-    body, rest = lumpy(model), fit_of(np.zeros((4, 3)))
-    poses = random_poses(model, 3, np.random.default_rng(3))
-    trans = np.random.default_rng(4).normal(size=(3, 3))
-    batch = repose(model, body, poses, trans, rest)
-    for b in range(3):
-        np.testing.assert_allclose(repose(model, body, poses[b], None, rest) + trans[b], batch[b], atol=1e-12)
-
-
-def test_with_blended_rotations(model):
-    x = model.template.corners.mean(axis=1)[:, 0] - 0.3
-    part = model.skeleton.part_of_face
-    blend = np.zeros((len(x), 4))
-    near = 0.5 * np.exp(-(x + 0.35) ** 2 / 0.01)
-    blend[np.arange(len(x)), part] = 1 - near
-    blend[np.arange(len(x)), np.where(part == 1, 0, 1)] += near
-    fields = {name: getattr(model, name) for name in ("template", "skeleton", "pose_space", "shape_space", "pose_mean",
-                                                      "pose_covariance", "info")}
-    blended = BlendScapeModel(**fields, blend=blend)
-    pose, other = random_poses(model, 2, np.random.default_rng(5), 0.3)
-    betas = np.array([1.0, 1.0, -1.0])
-    found = own_body(blended, blended.vertices(pose, betas), fit_of(pose, betas))
-    np.testing.assert_allclose(found.subject.vertices(other), blended.vertices(other, betas), rtol=0, atol=1e-9)
-    assert own_body(blended, lumpy(model), fit_of(np.zeros((4, 3)))).mean < 1e-3
 
 
 def test_skinning_is_undone_exactly():
@@ -150,13 +110,6 @@ def test_refuses_other_bodies(model):
         repose(model, model.template.vertices, np.zeros((3, 3)), fit=rest)
     with pytest.raises(ValueError, match="vertices"):
         own_body(model, np.full(model.template.vertices.shape, np.nan), rest)
-
-
-def test_without_shape_components_too(model):
-    bare = replace(model, shape_space=model.shape_space.first(0))
-    pose = random_poses(model, 1, np.random.default_rng(7), 0.2)[0]
-    found = own_body(bare, bare.vertices(pose))
-    assert found.mean < 1e-3 and found.subject.betas is None
 
 
 def test_from_the_command_line(model, tmp_path):

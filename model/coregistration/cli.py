@@ -103,9 +103,9 @@ def _figures(done: Coregistration, names: Sequence[str]) -> list[Metric]:
     return [Metric("scans registered", f"{int(done.good.sum())} of {len(done.good)}"),
             Metric("failed", ", ".join(bad) or "none"),
             Metric("rounds", done.rounds), Metric("converged", done.converged),
-            *(Metric(f"round {i}: failed", turn.failed) for i, turn in enumerate(done.history, 1)),
-            *(Metric(f"round {i}: mean vertex moved", 1e3 * turn.change, "mm")
-              for i, turn in enumerate(done.history, 1) if i > 1),
+            *(Metric(f"round {i}: failed", failed) for i, failed in enumerate(done.failed, 1)),
+            *(Metric(f"round {i}: mean vertex moved", 1e3 * change, "mm")
+              for i, change in enumerate(done.changes, 1) if i > 1),
             Metric("distance to the scan, median RMS", 1e3 * float(np.median([r.rms for r in made])), "mm"),
             Metric("scan explained, mean", 100 * float(np.mean([r.explained for r in made])), "%"),
             Metric("distance from the model, median RMS", 1e3 * float(np.median([r.apart for r in made])), "mm"),

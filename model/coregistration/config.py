@@ -34,8 +34,6 @@ class CoregistrationConfig(Settings):
         Settings of learning the model again.
     rounds : int
         Largest number of rounds of registering all scans and learning the model.
-    tolerance : float
-        Converged when a round moves the mean vertex by less than this share of √area.
     failed : float
         A scan has failed if a larger share of its points stays unexplained. The model is not learned from it.
     workers : Workers
@@ -54,6 +52,5 @@ class CoregistrationConfig(Settings):
     registration: RegistrationConfig = NEAR
     learn: LearnConfig = field(default_factory=LearnConfig)
     rounds: Annotated[Count, FLAG] = 3
-    tolerance: float = 0.0007
     failed: Share = 0.015
     workers: Workers = field(default_factory=Workers)

@@ -26,22 +26,8 @@ from .single import Landmarks, ModelRegistration, register_with_model
 
 Progress = Callable[[int, int], None]
 Scan = Mesh | np.ndarray
+SETTLED = 0.0007                     # share of √area, 1 mm on a man: a round that moves the mean vertex less ends it
 Lessons = tuple[np.ndarray, np.ndarray | None]       # poses (M, N, 3) of the template's person, shapes (S, N, 3)
-
-
-@dataclass(frozen=True)
-class Round:
-    """Figures of one round.
-
-    `failed` scans; `explained`, the mean share of a scan's points near the mesh; `apart`, the median over scans of the
-    RMS distance from mesh to model, metres; `change`, how far the mean vertex moved since the round before, metres (NaN
-    in the first).
-    """
-
-    failed: int
-    explained: float
-    apart: float
-    change: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,14 +46,16 @@ class Coregistration:
         Rounds that were done.
     converged : bool
         Whether the last round moved the mean vertex less than the tolerance.
-    history : tuple of Round
-        Figures of every round.
+    failed : tuple of int
+        Scans that failed in every round.
+    changes : tuple of float, metres
+        How far the mean vertex moved in every round; NaN in the first.
     failures : dict of str to str
         By the name of a scan, why it could not be registered at all.
 
     Examples
     --------
-    >>> done = Coregistration((), np.ones(3, dtype=bool), None, 2, True, ())
+    >>> done = Coregistration((), np.ones(3, dtype=bool), None, 2, True, (0, 0), (np.nan, 0.001))
     >>> int(done.good.sum()), done.converged
     (3, True)
 
@@ -79,7 +67,8 @@ class Coregistration:
     model: BodyModel
     rounds: int
     converged: bool
-    history: tuple[Round, ...]
+    failed: tuple[int, ...]
+    changes: tuple[float, ...]
     failures: Mapping[str, str] = field(default_factory=dict)
 
 
@@ -147,7 +136,7 @@ def coregister(model: BodyModel, scans: Sequence[Scan], landmarks: Sequence[Land
     Returns
     -------
     Coregistration
-        Registrations of all scans, the model, and the history of the rounds.
+        Registrations of all scans, the model, and figures of the rounds.
 
     Raises
     ------
@@ -179,22 +168,23 @@ def coregister(model: BodyModel, scans: Sequence[Scan], landmarks: Sequence[Land
     labels = [f"scan {i}" for i in range(n)] if names is None else list(names)
     marks = list(landmarks) if landmarks is not None else [None for _ in scans]
     before: list[np.ndarray | None] = list(starts) if starts is not None else [None for _ in scans]
-    own, history = _own(subjects, n), list[Round]()
+    own, failed, changes = _own(subjects, n), list[int](), list[float]()
     good, registrations, failures = np.zeros(n, dtype=bool), list[ModelRegistration | None](), dict[str, str]()
     with workspace_or_temporary(space) as kept:
-        while len(history) < config.rounds and not _has_settled(history, model, config):
+        while len(changes) < config.rounds and not _has_settled(changes, model):
             # 1. register all scans with the model of this round
-            turn, last = len(history), registrations
+            turn, last = len(changes), registrations
             ready = [OneScan(scans[i], marks[i], before[i], bool(own[i])) for i in range(n)]
             registrations, failures = _register_round(kept, model, ready, labels, config, turn, progress)
             good = np.array([r is not None and r.explained >= 1 - config.failed for r in registrations], dtype=bool)
             # 2. learn the model again from the good registrations, which also start the next round
             lessons = _lessons(registrations, good, own, subjects, failures)
-            history.append(_summary(registrations, good, last))
+            failed.append(int((~good).sum()))
+            changes.append(_mean_move(registrations, good, last))
             model = _taught(kept, model, lessons, config, turn)
             before = [start if r is None else r.mesh.vertices for r, start in zip(registrations, before, strict=True)]
-    return Coregistration(tuple(registrations), good, model, len(history), _has_settled(history, model, config),
-                          tuple(history), failures)
+    return Coregistration(tuple(registrations), good, model, len(changes), _has_settled(changes, model),
+                          tuple(failed), tuple(changes), failures)
 
 
 def task_name(turn: int, name: str) -> str:
@@ -264,19 +254,18 @@ def _lessons(registrations: Sequence[ModelRegistration | None], good: np.ndarray
     return np.stack(poses), shapes
 
 
-def _summary(registrations: Sequence[ModelRegistration | None], good: np.ndarray,
-             before: Sequence[ModelRegistration | None]) -> Round:
-    there = [r for r in registrations if r is not None]
+def _mean_move(registrations: Sequence[ModelRegistration | None], good: np.ndarray,
+               before: Sequence[ModelRegistration | None]) -> float:
+    """Compute how far the mean vertex of good scans moved since the round before, metres; NaN in the first round."""
     moved = [float(np.linalg.norm(r.mesh.vertices - b.mesh.vertices, axis=1).mean())
              for r, b, fine in zip(registrations, before, good, strict=False)
              if fine and r is not None and b is not None]
-    return Round(int((~good).sum()), float(np.mean([r.explained for r in there])),
-                 float(np.median([r.apart for r in there])), float(np.mean(moved)) if moved else np.nan)
+    return float(np.mean(moved)) if moved else np.nan
 
 
-def _has_settled(history: Sequence[Round], model: BodyModel, config: CoregistrationConfig) -> bool:
+def _has_settled(changes: Sequence[float], model: BodyModel) -> bool:
     size = float(np.sqrt(model.template.face_areas.sum()))
-    return bool(history and history[-1].change <= config.tolerance * size)
+    return bool(changes and changes[-1] <= SETTLED * size)
 
 
 def coregistration_doubts(done: Coregistration, names: Sequence[str]) -> list[str]:

@@ -1,1 +1,1 @@
-"""How good a body model is: held-out errors, compactness, specificity, random bodies, and a page of them."""
+"""How good a body model is: held-out errors, compactness, and random bodies."""

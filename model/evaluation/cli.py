@@ -23,15 +23,15 @@ from ..digests import digest, was_trained_on
 from ..files import load_model
 from ..posing.cli import read_subject
 from ..shape_statistics import SEXES, WORDS, Sex
-from .errors import Errors, compactness, errors_problem, pose_errors, shape_errors
+from .errors import Errors, errors_problem, pose_errors, shape_errors
 from .page import MM, Findings, evaluation_page, generalisation_rows, picture_samples
-from .sampling import sample_bodies, specificity
+from .sampling import sample_bodies
 
 
 def evaluate(model: ModelArg, output: Output, poses: Path | None = None, shapes: Path | None = None,
              counts: tuple[Count, ...] = (10, 20, 40), train_shapes: Path | None = None, subject: Path | None = None,
              unit: Unit | None = None) -> Outcome:
-    """Errors of a model on bodies that it was not trained on, with a page of curves and pictures.
+    """Errors of a model on bodies that it was not trained on, with a page of pictures.
 
     Example: scape model evaluate model.npz --poses held_poses --shapes held_people -o evaluation
 
@@ -41,7 +41,7 @@ def evaluate(model: ModelArg, output: Output, poses: Path | None = None, shapes:
         poses: Held-out meshes of the model's own body, or a registered set.
         shapes: Held-out people, or a registered set, of which the first mesh of each subject counts.
         counts: Numbers of shape components to fit people with.
-        train_shapes: The people that the model was trained on: adds plain PCA of vertices and specificity.
+        train_shapes: The people that the model was trained on: adds plain PCA of vertices.
         subject: Whose poses they are, betas or a mesh; else the template's own body.
         unit: Unit of the meshes.
     """
@@ -57,18 +57,14 @@ def evaluate(model: ModelArg, output: Output, poses: Path | None = None, shapes:
     posed, pose_names = read_bodies(poses, loaded.template, unit, one_person=True) if poses else nothing
     people, people_names = read_bodies(shapes, loaded.template, unit) if shapes else nothing
     train, _ = read_bodies(train_shapes, loaded.template, unit) if train_shapes else nothing
-    poses_found = shapes_found = specific = None
+    poses_found = shapes_found = None
     if posed is not None:
         with bar("fitting poses") as progress:
             poses_found = pose_errors(loaded, posed, read_subject(loaded, subject, unit), progress=progress)
     if people is not None:
         with bar("fitting people") as progress:
             shapes_found = shape_errors(loaded, people, counts, train, progress=progress)
-    if train is not None:
-        with bar("bringing training people to rest") as progress:
-            specific = specificity(loaded, train, 100, np.random.default_rng(0), counts, progress=progress)
-    samples = sample_bodies(loaded, 8, np.random.default_rng(0)) if loaded.n_betas else None      # on the page
-    found = Findings(poses_found, pose_names, posed, shapes_found, people_names, people, specific, samples)
+    found = Findings(poses_found, pose_names, posed, shapes_found, people_names, people)
     notes, metrics = _notes(loaded, posed, people), _metrics(loaded, found)
     metrics += [Metric("note", note) for note in notes]
     _write_tables(output, loaded, found)
@@ -148,16 +144,12 @@ def _metrics(model: BodyModel, found: Findings) -> list[Metric]:
         rows += _about("poses", found.poses.errors, found.pose_names, found.poses.converged)
     if found.shapes is not None:
         rows += _about("people", found.shapes.errors[-1], found.shape_names, found.shapes.converged)
-        for count, fitted, _, _, held, pca in generalisation_rows(found.shapes):
-            rows += [Metric(f"people, components {count}", fitted, "mm"),
-                     Metric(f"people, components {count}, pose held", held, "mm")]
+        # how much every number of components leaves, and plain PCA of vertices beside it
+        for count, fitted, _, _, pca in generalisation_rows(found.shapes):
+            rows.append(Metric(f"people, components {count}", fitted, "mm"))
             if found.shapes.vertex_pca is not None:
                 rows.append(Metric(f"people, components {count}, vertex PCA", pca, "mm"))
-            rows.append(Metric(f"variance, components {count}", 100 * float(compactness(model)[count - 1]), "%"))
-    if found.specificity is not None:
-        rows += [Metric(f"specificity, components {count}", MM * float(far.mean()), "mm")
-                 for count, far in zip(found.specificity.counts, found.specificity.distances, strict=True)]
-        rows.append(Metric("training people to their nearest", MM * found.specificity.between_people, "mm"))
+            rows.append(Metric(f"variance, components {count}", 100 * float(model.explained[count - 1]), "%"))
     return rows
 
 

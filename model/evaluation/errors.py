@@ -1,4 +1,4 @@
-"""How good a model is: held-out errors of pose and shape, compactness.
+"""How good a model is: held-out errors of pose and shape.
 
 All figures use only the common interface of `BodyModel`, so that kinds of model can be compared.
 """
@@ -65,14 +65,13 @@ class PoseErrors:
 class ShapeErrors:
     """Result of `shape_errors`, for several rising numbers of components, `counts` (C,).
 
-    For each count it holds the `errors` after `fit_shape`, those with the pose held at the parts' Procrustes rotations
-    (`pose_held`), and those of plain PCA of centred vertices (`vertex_pca`; None without training people). Then betas
-    (C, S, K), poses (C, S, J, 3), trans (C, S, 3) and which fits converged (C, S).
+    For each count it holds the `errors` after `fit_shape`, and those of plain PCA of centred vertices (`vertex_pca`;
+    None without training people). Then betas (C, S, K), poses (C, S, J, 3), trans (C, S, 3) and which fits converged
+    (C, S).
     """
 
     counts: np.ndarray
     errors: tuple[Errors, ...]
-    pose_held: tuple[Errors, ...]
     vertex_pca: tuple[Errors, ...] | None
     betas: np.ndarray
     poses: np.ndarray
@@ -182,9 +181,8 @@ def shape_errors(model: BodyModel, people: np.ndarray, counts: Sequence[int] = (
     # one fitter for all counts; each count begins where the smaller one ended
     largest = ShapeFitter(model, replace(config or FitConfig(), n_betas=wanted[-1]))
     fitters = [largest.first(count) for count in wanted]
-    held_pose, fits = [], list[list[ShapeFit]]()
+    fits = list[list[ShapeFit]]()
     for done, person in enumerate(people):
-        held_pose.append(fit_with_held_pose(model, person, wanted))
         fits.append([])
         for fitter in fitters:
             fits[-1].append(fitter.fit(person, fits[-1][-1] if fits[-1] else None))
@@ -196,33 +194,11 @@ def shape_errors(model: BodyModel, people: np.ndarray, counts: Sequence[int] = (
         return tuple(errors_between(model, bodies, people) for bodies in made)
 
     return ShapeErrors(
-        np.array(wanted), errors([f.vertices for f in row] for row in by_count), errors(zip(*held_pose, strict=True)),
+        np.array(wanted), errors([f.vertices for f in row] for row in by_count),
         None if train is None else errors(_by_components(check_bodies(model.template, train, "train"), people,
                                                          wanted)),
         *(np.array([[getattr(f, name) for f in row] for row in by_count])
           for name in ("betas", "pose", "trans", "converged")))
-
-
-def fit_with_held_pose(model: BodyModel, person: np.ndarray, counts: Sequence[int]) -> list[np.ndarray]:
-    """Fit betas and place with the pose held at the parts' Procrustes rotations: a body (N, 3), metres, for each count.
-
-    Vertices are affine in betas, so this is linear least squares, and one normal matrix serves all counts.
-    """
-    J, K = len(model.skeleton.parents), max(counts)
-    pose = model.skeleton.pose_of(model.skeleton.fit_rotations(model.template, person))
-    by_shape = model.shape_jacobian(pose)[..., :K]
-    mean = model.vertices(pose, np.zeros(K), np.zeros(3))
-    assert by_shape.shape == (len(mean), 3, K) and pose.shape == (J, 3)
-    # the place is free, so all is centred
-    centred, left = by_shape - by_shape.mean(axis=0), (person - mean) - (person - mean).mean(axis=0)
-    columns = centred.reshape(-1, K)
-    normal, slope = columns.T @ columns, columns.T @ left.ravel()
-    made = []
-    for count in counts:
-        betas = np.linalg.solve(normal[:count, :count], slope[:count])
-        moved = mean + by_shape[..., :count] @ betas
-        made.append(moved + (person - moved).mean(axis=0))
-    return made
 
 
 def vertex_components(train: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
@@ -244,11 +220,6 @@ def _by_components(train: np.ndarray, people: np.ndarray, counts: Sequence[int])
     weights = ((people - middles).reshape(len(people), -1) - mean) @ components.T
     return [[(mean + w[:count] @ components[:count]).reshape(-1, 3) + middle
              for w, middle in zip(weights, middles, strict=True)] for count in counts]
-
-
-def compactness(model: BodyModel) -> np.ndarray:
-    """Return the share (K,) of the training people's shape variance that the first 1..K components explain."""
-    return np.asarray(model.explained, dtype=np.float64)
 
 
 def check_counts(model: BodyModel, counts: Sequence[int]) -> list[int]:

@@ -1,9 +1,8 @@
-"""The page of `scape model evaluate`: curves, heat maps, the best and the worst, random bodies."""
+"""The page of `scape model evaluate`: heat maps, the best and the worst body; and a sheet of random bodies."""
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
@@ -15,12 +14,10 @@ from scanprep.pictures.scene import Pane, picture_panes
 from scanprep.pictures.shading import Heat, Solid
 
 from ..body import BodyModel
-from ..report import component_panes
-from .errors import Errors, PoseErrors, ShapeErrors, compactness
-from .sampling import Samples, Specificity
+from .errors import Errors, PoseErrors, ShapeErrors
+from .sampling import Samples
 
 MM = 1000.0
-MOST = 12                            # random bodies on the page
 Tell = Callable[[int, int], None]
 
 
@@ -34,20 +31,17 @@ class Findings:
     shapes: ShapeErrors | None = None
     shape_names: tuple[str, ...] = ()
     shape_bodies: np.ndarray | None = None
-    specificity: Specificity | None = None
-    samples: Samples | None = None
 
 
 def evaluation_page(name: str, model: BodyModel, found: Findings, metrics: Sequence[Metric],
                     notes: Sequence[str] = (), report_progress: Tell | None = None) -> Page:
-    """Make the page, self-contained: notes, the table of metrics, pictures and curves."""
+    """Make the page, self-contained: notes, the table of metrics, and pictures."""
     page = Page(f"{name}, evaluated", f"A model of kind {model.kind} with {len(model.skeleton.parents)} parts and "
                 f"{model.n_betas} shape components, measured on bodies given to it.")
     for note in notes:
         page.text(f"Note: {note}.")
     page.figures(metrics)
-    wanted = [section for section, there in ((_pose_section, found.poses), (_shape_section, found.shapes),
-                                             (_space_section, model.n_betas)) if there]
+    wanted = [section for section, there in ((_pose_section, found.poses), (_shape_section, found.shapes)) if there]
     for i, section in enumerate(wanted):
         section(page, model, found)
         if report_progress:
@@ -60,7 +54,6 @@ def _pose_section(page: Page, model: BodyModel, found: Findings) -> None:
     assert poses is not None and bodies is not None
     page.section("Poses", "One known body, of which only pose and place were fitted. What is left is what the model "
                  "does not know about how the body bends.")
-    page.chart(chart_bodies(poses.errors, names), "distance of corresponding vertices, each body")
     rest = model.template.with_vertices(model.vertices(np.zeros_like(poses.poses[0]), poses.betas))
     page.bodies([error_pane(rest, poses.errors.by_vertex, "mean over the bodies")],
                 "where the error lies: mean of all bodies, shown on the body at rest")
@@ -77,19 +70,8 @@ def _shape_section(page: Page, model: BodyModel, found: Findings) -> None:
     shapes, bodies, names = found.shapes, found.shape_bodies, found.shape_names
     assert shapes is not None and bodies is not None
     page.section("People", "Of every person shape, pose and place were fitted, with more and more components.")
-    # the curve of generalisation: mean error by the number of components, and as a table
-    figure, axes = _figure(7.0, 3.0)
-    axes.plot(shapes.counts, [MM * e.overall for e in shapes.errors], "o-", label="shape, pose and place fitted")
-    axes.plot(shapes.counts, [MM * e.overall for e in shapes.pose_held], "s--", color="0.45",
-              label="pose held at the parts' own rotations")
-    if shapes.vertex_pca is not None:
-        axes.plot(shapes.counts, [MM * e.overall for e in shapes.vertex_pca], "^:", color="C1",
-                  label="plain PCA of vertices")
-    axes.set(xlabel="shape components", ylabel="distance (mm)", ylim=(0, None))
-    axes.legend(frameon=False)
-    page.chart(figure, "mean over people and vertices")
     page.table(generalisation_rows(shapes), ("components", "fitted (mm)", "95th percentile (mm)", "worst vertex (mm)",
-                                             "pose held (mm)", "vertex PCA (mm)"))
+                                             "vertex PCA (mm)"))
     # with all components: where the error lies, and the best and the worst person
     last, count = shapes.errors[-1], int(shapes.counts[-1])
     rest = model.template.with_vertices(model.vertices(np.zeros_like(shapes.poses[0, 0]), np.zeros(1)))
@@ -97,41 +79,13 @@ def _shape_section(page: Page, model: BodyModel, found: Findings) -> None:
                 "where the error lies: mean of all people, shown on the mean person")
     page.bodies(extreme_panes(model, last, names, bodies, lambda i: shapes.vertices(model, -1, i), shapes.poses[-1]),
                 "the best and the worst person: as given, then the fitted body coloured by its error")
-    page.chart(chart_bodies(last, names), f"distance of corresponding vertices, each person, {count} components")
 
 
-def _space_section(page: Page, model: BodyModel, found: Findings) -> None:
-    page.section("Space of shapes", "How much of the training people's variance the components explain, and what "
-                 "they do.")
-    figure, axes = _figure(7.0, 2.6)
-    explained = compactness(model)
-    axes.plot(np.arange(len(explained) + 1), 100 * np.concatenate([[0], explained]), "-")
-    axes.set(xlabel="shape components", ylabel="variance explained (%)", ylim=(0, 100), xlim=(0, len(explained)))
-    page.chart(figure, "compactness")
-    page.bodies(component_panes(model), "the mean person, then the first components", 260)
-    if found.specificity is not None:
-        page.text("Specificity: random bodies of the model against the nearest training person. Small is good, as "
-                  "long as it is not far below the distance between people themselves. The people were brought to "
-                  "rest: each was fitted with all components, and what the fit leaves was turned back with the parts.")
-        figure, axes = _figure(7.0, 2.6)
-        far, counts = MM * found.specificity.distances, found.specificity.counts
-        axes.fill_between(counts, *np.percentile(far, [10, 90], axis=1), alpha=0.25, linewidth=0,
-                          label="10th to 90th percentile")
-        axes.plot(counts, far.mean(axis=1), "o-", label="mean")
-        axes.axhline(MM * found.specificity.between_people, color="0.45", linestyle="--", linewidth=1,
-                     label="training people to their nearest other")
-        axes.set(xlabel="shape components", ylabel="distance (mm)", ylim=(0, None))
-        axes.legend(frameon=False)
-        page.chart(figure, "mean vertex distance to the nearest training person")
-    if found.samples is not None:
-        page.bodies(sample_panes(model, found.samples)[:MOST], "random bodies", 220)
-
-
-def generalisation_rows(shapes: ShapeErrors) -> list[tuple[int, float, float, float, float, float]]:
-    """List by components: fitted, 95th percentile, worst vertex, pose held, vertex PCA (NaN without), millimetres."""
+def generalisation_rows(shapes: ShapeErrors) -> list[tuple[int, float, float, float, float]]:
+    """List by components: fitted, 95th percentile, worst vertex, vertex PCA (NaN without), millimetres."""
     pca = [np.nan] * len(shapes.counts) if shapes.vertex_pca is None else [MM * e.overall for e in shapes.vertex_pca]
-    return [(int(k), MM * e.overall, MM * float(e.p95.mean()), MM * float(e.worst.max()), MM * held.overall, plain)
-            for k, e, held, plain in zip(shapes.counts, shapes.errors, shapes.pose_held, pca, strict=True)]
+    return [(int(k), MM * e.overall, MM * float(e.p95.mean()), MM * float(e.worst.max()), plain)
+            for k, e, plain in zip(shapes.counts, shapes.errors, pca, strict=True)]
 
 
 def error_pane(body: Mesh, distance: np.ndarray, title: str) -> Pane:
@@ -161,17 +115,12 @@ def extreme_panes(model: BodyModel, errors: Errors, names: Sequence[str], bodies
     return panes
 
 
-def sample_panes(model: BodyModel, samples: Samples) -> list[Pane]:
-    """Draw random bodies, numbered."""
-    camera = look_around(model.template, samples.vertices, (25,))[0]
-    return [Pane([model.template.with_vertices(v)], camera, str(i + 1)) for i, v in enumerate(samples.vertices)]
-
-
-def picture_samples(model: BodyModel, samples: Samples, height: int = 300) -> np.ndarray:
+def picture_samples(model: BodyModel, samples: Samples) -> np.ndarray:
     """Picture random bodies on a contact sheet, numbered."""
-    panes = sample_panes(model, samples)
+    camera = look_around(model.template, samples.vertices, (25,))[0]
+    panes = [Pane([model.template.with_vertices(v)], camera, str(i + 1)) for i, v in enumerate(samples.vertices)]
     rows = max(1, round(np.sqrt(len(panes) / 2.5)))
-    return picture_panes(panes, height, -(-len(panes) // rows))
+    return picture_panes(panes, 300, -(-len(panes) // rows))
 
 
 def _round_up(length: float) -> float:
@@ -179,27 +128,3 @@ def _round_up(length: float) -> float:
     power = 10.0 ** np.floor(np.log10(max(length, 1e-9)))
     steps = (1, 1.2, 1.6, 2, 2.4, 3.2, 4, 6, 8, 10)
     return float(power * min(step for step in steps if step * power >= length * (1 - 1e-9)))
-
-
-def _figure(width: float, height: float) -> tuple[Any, Any]:
-    """Make a matplotlib figure, sizes in inches, and its axes."""
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(width, height))
-    return figure, figure.add_subplot()
-
-
-def chart_bodies(errors: Errors, names: Sequence[str]) -> Any:
-    """Plot mean and 95th percentile of every body, worst first, as a matplotlib figure."""
-    figure, axes = _figure(8.0, 2.8)
-    order = np.argsort(-errors.mean)
-    place = np.arange(len(order))
-    axes.bar(place, MM * errors.mean[order], width=0.7, label="mean")
-    axes.plot(place, MM * errors.p95[order], "_", color="0.35", markersize=7, label="95th percentile")
-    axes.set(ylabel="distance (mm)", ylim=(0, None), xlim=(-0.7, len(order) - 0.3))
-    axes.set_xticks(place, [names[i] for i in order], rotation=90, fontsize=8 if len(order) <= 50 else 5)
-    axes.legend(frameon=False, loc="lower right", bbox_to_anchor=(1, 1), ncols=2)
-    return figure
-
-
-

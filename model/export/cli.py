@@ -125,11 +125,11 @@ class Order:
 
 
 def write_frames(folder: str | Path, subject: Subject, poses: np.ndarray, trans: np.ndarray | None = None,
-                 ending: str = ".ply", progress: Progress | None = None) -> list[Path]:
+                 progress: Progress | None = None) -> list[Path]:
     """Write the exact mesh of every frame, 00000.ply, 00001.ply, ...; return the files in the order of the frames."""
     paths = []
     for t, pose in enumerate(poses):
-        paths.append(Path(folder) / f"{t:05d}{ending}")
+        paths.append(Path(folder) / f"{t:05d}.ply")
         vertices = subject.vertices(pose, None if trans is None else trans[t])
         write_mesh(paths[-1], subject.template.with_vertices(vertices), "single")
         if progress:

@@ -136,8 +136,7 @@ def _scale_to_unit(mean: np.ndarray, basis: np.ndarray, weights: np.ndarray, fra
     return Correctives(shapes, np.column_stack([np.ones(len(weights)), (weights - low) / span]), frames)
 
 
-def write_body_npz(path: str | Path, model: BodyModel, weights: np.ndarray | None = None, draws: int = 300
-                   ) -> dict[str, np.ndarray]:
+def write_body_npz(path: str | Path, model: BodyModel, draws: int = 300) -> dict[str, np.ndarray]:
     """Write a model as linear blend skinning with shape and pose directions, in the usual layout of body models.
 
     The pose is `Σ_j weights_j G_j (v_template + shapedirs @ betas + posedirs @ vec(R_1 - I, ..., R_{J-1} - I))`.
@@ -151,8 +150,6 @@ def write_body_npz(path: str | Path, model: BodyModel, weights: np.ndarray | Non
         `.npz` file to write; it holds no pickled objects.
     model : BodyModel
         The model.
-    weights : (N, J) float, optional
-        Blend weights, as for `make_rig`.
     draws : int
         Random poses to which pose directions are fitted; 0 for none. An imported model has its own.
 
@@ -175,7 +172,7 @@ def write_body_npz(path: str | Path, model: BodyModel, weights: np.ndarray | Non
     Loper et al., SMPL, 2015.
     """
     mean = np.zeros(0)
-    rig = make_rig(model, mean, model.n_betas, weights)
+    rig = make_rig(model, mean, model.n_betas)
     J = len(model.skeleton.parents)
     arrays = {
         "v_template": rig.mesh.vertices, "f": rig.mesh.faces.astype(np.int64), "weights": rig.weights,

@@ -1,7 +1,6 @@
 """`scape learn`: a body model from registered meshes."""
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 from shlex import quote
 from typing import Annotated
@@ -24,7 +23,7 @@ from scanprep.skeleton.names import note_numbered_parts
 from scanprep.skeleton.roles import joint_in_words
 from scanprep.skeleton.tree import Skeleton
 
-from ..body import BodyModel, Up
+from ..body import BodyModel
 from ..cli import about, read_bodies
 from ..fitting.search import ModelMismatchError
 from .body import Kind, learn_body
@@ -36,11 +35,10 @@ from .skinning import SkinConfig
 WITH_PRIOR = "scape", "blendscape"
 
 
-def learn(poses: Path, output: Output, shapes: Path | None = None, template: Path | None = None,
-          skeleton: Path | None = None, landmarks: Path | None = None, subject: Annotated[str | None, Person] = None,
-          unit: Unit | None = None, up: Up | None = None, kind: Kind = "scape", by_sex: bool = False,
-          prior: str = "auto", scape: LearnConfig = LearnConfig(), skinning: SkinConfig = SkinConfig(),
-          mixed: LearnConfig = MIX, *, space: FileWorkspace) -> Outcome:
+def learn(poses: Path, output: Output, shapes: Path | None = None, skeleton: Path | None = None,
+          landmarks: Path | None = None, subject: Annotated[str | None, Person] = None, unit: Unit | None = None,
+          kind: Kind = "scape", by_sex: bool = False, prior: str = "auto", scape: LearnConfig = LearnConfig(),
+          skinning: SkinConfig = SkinConfig(), mixed: LearnConfig = MIX, *, space: FileWorkspace) -> Outcome:
     """Learn a body model from one person in many poses and many people in about one pose, or from a mix.
 
     From few scans it is a known model, adapted: what they do not show, how joints bend and how people differ, is as
@@ -51,18 +49,16 @@ def learn(poses: Path, output: Output, shapes: Path | None = None, template: Pat
     Example: scape learn --poses set --shapes set -o model.npz
 
     Args:
-        poses: Folder of meshes of one person that share their triangles, or a registered set.
+        poses: Folder of meshes of one person that share their triangles, or a registered set. The template is the
+            first of the meshes, or the set's own.
         output: Model file to write.
         shapes: Folder of meshes of many people, or a registered set; without it the model has no shape of its own.
-        template: The mesh that the others are deformations of; else the first of the poses, or the set's own.
         skeleton: JSON of `scape prep skeleton`; else the set's own, where there is no prior or 40 poses. Else it is
             found from the poses and those of the prior, with as many parts as predict left-out poses best. For a given
             number of parts: `scape prep skeleton --parts`.
         landmarks: Landmarks of the template, kept in the model for `scape complete`; else the set's own.
         subject: Of a registered set, whose meshes are the poses; else of the one with the most.
         unit: Unit of the meshes.
-        up: Axis of the meshes that points up, kept in the model; else as the files say (GLB: y), else that along which
-            the poses stand on their feet, else that of the largest extent.
         kind: SCAPE, BlendSCAPE, linear blend skinning with pose-corrective shapes, or SCAPE from a mix: the poses are
             then those of many people, a registered set that says whose mesh each is.
         prior: Where scans say little, as in this model: a file, "people", "none", or "auto", the built-in people for a
@@ -88,8 +84,7 @@ def learn(poses: Path, output: Output, shapes: Path | None = None, template: Pat
         raise UsageError(f"--prior {prior}: expected the kind {' or '.join(WITH_PRIOR)} and not --preset published")
     # bodies to learn from, and the landmarks that the model keeps
     (body, posed, names), who = (_read_mix(poses) if kind == "mixed" else
-                                 (read_poses(poses, template, subject, unit), []))
-    body = body if up is None else replace(body, up="xyz".index(up))
+                                 (read_poses(poses, None, subject, unit), []))
     people = None
     doubts = find_doubtful_members(body, posed, str(poses), names, np.inf if kind == "mixed" else ONE_BODY)
     if shapes is not None:
@@ -124,7 +119,7 @@ def learn(poses: Path, output: Output, shapes: Path | None = None, template: Pat
         *_about_choice(learned.choice), *_about_prior(learned.model),
         *[Metric(f"people of the {name} model", model.info["shapes"]) for name, model in learned.models.items()
           if by_sex],
-        *details([Metric("kind", learned.model.kind), Metric("triangles", len(body.faces)), *_about_steps(step)])],
+        *details([Metric("kind", learned.model.kind), Metric("triangles", len(body.faces))])],
                    {"scape": scape, "skinning": skinning, "mixed": mixed},
                    judgement=learned.judgement.merge(of_scans),
                    following=f"look at it: scape view {quote(str(output))}")
@@ -151,24 +146,11 @@ def _read_people(shapes: Path, body: Mesh, unit: Unit | None) -> tuple[np.ndarra
 
 
 def _about_choice(choice: ChosenSkeleton | None) -> list[Metric]:
-    """Say how many parts predict left-out poses as well, and what tying left and right costs or gains."""
+    """Say which other numbers of parts predict left-out poses as well."""
     if choice is None:
         return []
     fewest, most = choice.as_good
-    rows = [] if fewest == most else [Metric("parts that predict left-out poses as well", f"{fewest} to {most}")]
-    if np.isfinite(choice.other_error):
-        ours, others = ("alike", "free") if choice.tied else ("free", "alike")
-        rows.append(Metric("left and right", f"{ours}: left-out poses {1000 * choice.error:.3g} mm off, {others} "
-                           f"{1000 * choice.other_error:.3g}"))
-    return rows
-
-
-def _about_steps(step: KeptSteps) -> list[Metric]:
-    """List the seconds of every step; of a step that an earlier call had begun, those of the rest."""
-    begun = {name.split("/")[0] for name in step.found if "/" in name}
-    return [*(Metric(f"time: {name}", "done before") for name in step.found if "/" not in name),
-            *(Metric(f"time: {name}", value, "s, of what was left" if name in begun else "s")
-              for name, value in step.seconds.items() if "/" not in name)]
+    return [] if fewest == most else [Metric("parts that predict left-out poses as well", f"{fewest} to {most}")]
 
 
 def _about_prior(model: BodyModel) -> list[Metric]:

@@ -21,8 +21,6 @@ class LearnConfig(Settings):
         Twist directions of smaller variance are not regressed on; the best value is chosen by leaving poses out.
     ridges : tuple of float, square radians
         Strengths of the penalty; the best value is chosen by leaving poses out.
-    smoothness : float
-        Times the mean edge length it is w_s of Eq. 5 and 8.
     refinements : int
         How often part rotations are fitted anew to the learned model and the regression is corrected by what the
         stitched surface leaves; of a mix, the largest number of rounds.
@@ -44,7 +42,6 @@ class LearnConfig(Settings):
     regressor: Literal["ridge", "svr"] = "ridge"
     prunings: tuple[float, ...] = (0.003, 0.01, 0.03)
     ridges: tuple[Positive, ...] = (1e-4, 1e-3, 3e-3, 0.01, 0.03, 0.1)
-    smoothness: float = 0.001
     refinements: int = 4
     detail: float = 0.03
     components: int = 40
@@ -59,4 +56,4 @@ class LearnConfig(Settings):
 
         [SCAPE] Eq. 3, Eq. 4, Eq. 5, Eq. 7, Eq. 8
         """
-        return cls(prunings=(0.01,), ridges=(1e-9,), smoothness=0.001, refinements=0, detail=0.0)
+        return cls(prunings=(0.01,), ridges=(1e-9,), refinements=0, detail=0.0)

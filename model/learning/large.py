@@ -13,7 +13,7 @@ from scanprep.geometry.mesh import Mesh, check_template
 from scanprep.skeleton.tree import Skeleton
 
 from ..body import BodyModel, Progress
-from ..resolution.change import ResolutionConfig, change_resolution
+from ..resolution.change import change_resolution
 from ..resolution.transfer import transfer_skeleton
 
 LARGE = 60_000                       # vertices from which on learning takes more than 1 GB
@@ -64,7 +64,7 @@ class Resolutions:
             return dict(models)
         finished = {}
         for k, (name, model) in enumerate(models.items()):
-            moved = change_resolution(model, self.full, ResolutionConfig(rounds=0))
+            moved = change_resolution(model, self.full, rounds=0)
             finished[name] = replace(moved, info=moved.info | {"digests": digests})      # type: ignore[type-var]
             progress(k + 1, len(models))
         return finished

@@ -152,7 +152,7 @@ def _learn_pose(mix: Mix, state: MixingState) -> tuple[PoseSpace, Design]:
     [SCAPE] Eq. 4, Eq. 5
     """
     parts, config, poses, S = mix.parts, mix.config, state.poses, state.S.astype(np.float64)
-    gradients = GradientSystem(parts.template, config.smoothness, parts.skeleton.part_of_face)
+    gradients = GradientSystem(parts.template, parts=parts.skeleton.part_of_face)
     # S⁻¹, a tenth damped against triangles that somebody has nearly flat; the identity stays the identity
     inverse = 1.1 * np.swapaxes(S, -1, -2) @ np.linalg.inv(S @ np.swapaxes(S, -1, -2) + 0.1 * np.eye(3))
     back = np.swapaxes(inverse, -1, -2)
@@ -189,7 +189,7 @@ def _learn_people(mix: Mix, poses: np.ndarray, space: PoseSpace) -> np.ndarray:
         return np.concatenate(list(edges), axis=1)
 
     parts, P = mix.parts, int(mix.who.max()) + 1
-    system = GradientSystem(parts.template, mix.config.smoothness)
+    system = GradientSystem(parts.template)
     S = np.empty((P, len(parts.template.faces), 3, 3), dtype=np.float32)
     for person in range(P):
         bodies, own = mix.bodies[mix.who == person], poses[mix.who == person]

@@ -1,7 +1,7 @@
 """Choice of the number of parts by the error of left-out poses."""
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -42,8 +42,6 @@ class ChosenSkeleton:
         Error of left-out poses by the number of parts that were tried, with sides as in the skeleton.
     tied : bool
         Whether left and right have the same parts by construction.
-    other_error : float, metres
-        Least error of left-out poses with sides the other way; NaN where they were not tried.
 
     Examples
     --------
@@ -52,14 +50,13 @@ class ChosenSkeleton:
     >>> from scanprep.synthetic.topology import load_topology
     >>> mesh = load_topology().mesh
     >>> whole = Skeleton(np.zeros(len(mesh.faces), dtype=int), [-1], mesh.vertices.mean(axis=0)[None])
-    >>> ChosenSkeleton(whole, {1: 0.0101, 4: 0.014, 8: 0.01}, True, np.nan).as_good
+    >>> ChosenSkeleton(whole, {1: 0.0101, 4: 0.014, 8: 0.01}, True).as_good
     (1, 8)
     """
 
     skeleton: Skeleton
     errors: dict[int, float]
     tied: bool
-    other_error: float
     __repr__ = describe_result
 
     @property
@@ -124,8 +121,7 @@ def choose_skeleton(template: Mesh, poses: np.ndarray, progress: Progress | None
     # sides that are tied harm a body that stands crooked; the names of a person need them
     if chosen.tied and not is_person(chosen.skeleton):
         free = search.choose(False)
-        pair = (free, chosen) if free.error < (1 - GAIN) * chosen.error else (chosen, free)
-        chosen = replace(pair[0], other_error=pair[1].error)
+        chosen = free if free.error < (1 - GAIN) * chosen.error else chosen
     search.report_progress(search.whole, search.whole)
     return chosen
 
@@ -166,7 +162,7 @@ class PartsSearch:
             errors[count] = min(errors.get(count, np.inf), finer[1])
             if finer[1] <= (1 - GAIN * max(1, wanted / USUAL)) * least:
                 (best, least), vain = finer, 0
-        return ChosenSkeleton(best, errors, finder.runs[0].search.sides.tied, np.nan)
+        return ChosenSkeleton(best, errors, finder.runs[0].search.sides.tied)
 
     def _try(self, finder: SkeletonFinder, settings: SkeletonConfig, parts: int | None
              ) -> tuple[Skeleton, float] | None:

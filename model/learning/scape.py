@@ -215,8 +215,7 @@ def learn_pose_with(prior: TemplatePrior | None, parts: BlendedTemplate, bodies:
     if prior is None:
         return learn_pose(parts, bodies, config, work, POSES)
     # first the pose space of the prior's bodies, in the same way on this skeleton
-    known = learn_pose(parts, prior.poses, replace(PRIOR, features=config.features, smoothness=config.smoothness),
-                       work, POSES / 3)
+    known = learn_pose(parts, prior.poses, replace(PRIOR, features=config.features), work, POSES / 3)
     return learn_pose(parts, bodies, config, work, 2 * POSES / 3, known)
 
 
@@ -240,7 +239,7 @@ def learn_pose(parts: BlendedTemplate, bodies: np.ndarray, config: LearnConfig, 
     """
     template, skeleton = parts.template, parts.skeleton
     inputs = (parts, bodies, replace(config, components=0), prior and (prior.space, prior.poses))
-    system = GradientSystem(template, config.smoothness, skeleton.part_of_face)
+    system = GradientSystem(template, parts=skeleton.part_of_face)
 
     def first(_: ProgressShares) -> LearnedPose:
         """Fit Q of every body with the rotations of Procrustes, and regress it on the joint twists."""
@@ -327,29 +326,27 @@ def learn_people(parts: BlendedTemplate, space: PoseSpace, shapes: np.ndarray | 
     people = np.zeros((0, *parts.template.vertices.shape)) if shapes is None else shapes
 
     def learn(inner: ProgressShares) -> ShapeSpace:
-        S, volumes = shape_deformations(parts, space, people, config, inner), body_volumes(parts.template, people)
+        S, volumes = shape_deformations(parts, space, people, inner), body_volumes(parts.template, people)
         if prior is None:
             return learn_shape_space(S, config.components, volumes)
-        return add_people(S, volumes, prior_deformations(parts, space, prior.people, config),
+        return add_people(S, volumes, prior_deformations(parts, space, prior.people),
                           body_volumes(parts.template, prior.people), WORTH, config.components)
 
-    return work.step("shape components", (parts, space, people, config.smoothness, config.components,
-                                          prior and prior.people), 1 - POSES, learn)
+    return work.step("shape components", (parts, space, people, config.components, prior and prior.people), 1 - POSES,
+                     learn)
 
 
-def prior_deformations(parts: BlendedTemplate, space: PoseSpace, people: np.ndarray, config: LearnConfig
-                       ) -> np.ndarray:
+def prior_deformations(parts: BlendedTemplate, space: PoseSpace, people: np.ndarray) -> np.ndarray:
     """Fit S (1 + K, F, 3, 3), in float32, of the people of a prior, who all stand in the pose of the first.
 
     [SCAPE] Eq. 8
     """
     pose = parts.skeleton.pose_of(parts.skeleton.fit_rotations(parts.template, people[0]))
-    solve = ShapeSolver(GradientSystem(parts.template, config.smoothness), parts.deform_edges(space.gradients(pose)))
+    solve = ShapeSolver(GradientSystem(parts.template), parts.deform_edges(space.gradients(pose)))
     return np.stack([solve(parts.local_edges(person, pose)).astype(np.float32) for person in people])
 
 
-def shape_deformations(parts: BlendedTemplate, space: PoseSpace, shapes: np.ndarray, config: LearnConfig,
-                       work: ProgressShares
+def shape_deformations(parts: BlendedTemplate, space: PoseSpace, shapes: np.ndarray, work: ProgressShares
                        ) -> np.ndarray:
     """Fit S (P, F, 3, 3) of every person, in float32 to halve the memory.
 
@@ -359,7 +356,7 @@ def shape_deformations(parts: BlendedTemplate, space: PoseSpace, shapes: np.ndar
     [SCAPE] Eq. 8
     """
     template, skeleton = parts.template, parts.skeleton
-    system = GradientSystem(template, config.smoothness)
+    system = GradientSystem(template)
 
     def deformation(y: np.ndarray) -> np.ndarray:
         pose = skeleton.pose_of(skeleton.fit_rotations(template, y))
@@ -369,7 +366,7 @@ def shape_deformations(parts: BlendedTemplate, space: PoseSpace, shapes: np.ndar
     S = np.empty((len(shapes), len(template.faces), 3, 3), dtype=np.float32)
     with SideBySide(deformation, list(shapes)) as solved:
         for i, y in enumerate(shapes):
-            S[i] = work.step(f"person {body_digest(y)}", (parts, space, config.smoothness, y), 1 / len(shapes),
+            S[i] = work.step(f"person {body_digest(y)}", (parts, space, y), 1 / len(shapes),
                              lambda _, number=i: solved(number))                # type: ignore[misc]
     return S
 

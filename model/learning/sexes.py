@@ -71,7 +71,7 @@ def learn_by_sex(template: Mesh, poses: np.ndarray, shapes: np.ndarray, sexes: S
     learned = learn_pose_with(prior, parts, poses, config, work)
 
     def learn(inner: ProgressShares) -> tuple[dict[str, ShapeSpace], dict[str, object] | None]:
-        S = shape_deformations(parts, learned.space, people, config, inner)
+        S = shape_deformations(parts, learned.space, people, inner)
         volumes = body_volumes(template, people)
         spaces = {name: learn_shape_space(S[chosen], config.components, volumes[chosen])
                   for name, chosen in groups.items()}
@@ -80,8 +80,8 @@ def learn_by_sex(template: Mesh, poses: np.ndarray, shapes: np.ndarray, sexes: S
         known = np.isin(sex, SEXES)
         return spaces, learn_sex_plane(spaces["neutral"].betas_of(S[known]), sex[known].tolist()).to_arrays()
 
-    spaces, plane = work.step("shape components", (parts, learned.space, people, config.smoothness, config.components,
-                                                   list(sexes)), 1 - POSES, learn)
+    spaces, plane = work.step("shape components", (parts, learned.space, people, config.components, list(sexes)),
+                               1 - POSES, learn)
     common = training_metadata(template, skeleton, learned, poses, people, config, prior)
     if prior is not None:
         common["info"]["prior_people"] = 0.0                 # shapes are those of the people alone

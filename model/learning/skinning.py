@@ -10,11 +10,11 @@ import numpy as np
 from scanprep.batch.room import Step, run_uncached
 from scanprep.geometry.mesh import Mesh, take_any_mesh
 from scanprep.geometry.upright import find_up
-from scanprep.ranges import Count, Positive, Settings
+from scanprep.ranges import Count, Settings
 from scanprep.skeleton.tree import Skeleton
 from scanprep.threads import one_thread
 
-from ..blend_weights import diffuse, diffuse_weights, fit_weights, strongest
+from ..blend_weights import CARRIERS, diffuse, diffuse_weights, fit_weights, strongest
 from ..digests import body_digest
 from ..features import LinearLift, PoseFeatures, part_features
 from ..fitting.vertices import FitConfig, PoseFitter, ShapeFitter
@@ -34,6 +34,7 @@ from .scape import (
 )
 
 QUICK = FitConfig(sample=400, iterations=20, polish=0, tolerance=1e-4)     # poses are fitted again in the next round
+WIDTH = 0.05                         # metres over which the initial blend weights change: about the width of a joint
 
 
 @dataclass(frozen=True)
@@ -44,10 +45,6 @@ class SkinConfig(Settings):
     ----------
     correctives : bool
         Learn pose-corrective shapes, linear in the joint twists; else plain linear blend skinning.
-    parts : int
-        Largest number of parts that a vertex follows.
-    width : float, metres
-        Width over which the initial blend weights change from part to part.
     rounds : int
         Largest number of rounds in which poses, weights and joints are fitted in turn, first without and then with
         correctives.
@@ -56,15 +53,13 @@ class SkinConfig(Settings):
 
     Examples
     --------
-    >>> SkinConfig(correctives=False).parts
-    4
+    >>> SkinConfig(correctives=False).components
+    40
 
     Loper et al., SMPL, 2015.
     """
 
     correctives: bool = True
-    parts: Count = 4
-    width: Positive = 0.05
     rounds: Count = 8
     components: int = 40
 
@@ -120,7 +115,7 @@ def learn_skinning(template: Mesh, poses: np.ndarray, shapes: np.ndarray | None,
 
     def learn(inner: ProgressShares) -> tuple[SkinningModel, np.ndarray]:
         at = skeleton.pose_of(skeleton.fit_rotations(template, poses))
-        model = _start(template, skeleton, config)
+        model = _start(template, skeleton)
         for correctives in kinds:
             model, at = _learn_pose(model, at, poses, replace(config, correctives=correctives), 1 / len(kinds), inner)
         return model, at
@@ -137,11 +132,11 @@ def learn_skinning(template: Mesh, poses: np.ndarray, shapes: np.ndarray | None,
     return replace(model, pose_mean=mean, pose_covariance=covariance, pose_examples=examples, info=info)
 
 
-def _start(template: Mesh, skeleton: Skeleton, config: SkinConfig) -> SkinningModel:
+def _start(template: Mesh, skeleton: Skeleton) -> SkinningModel:
     """Build the initial model: the template with smooth blend weights and without correctives."""
     J, N = len(skeleton.parents), len(template.vertices)
     constants = corrective_features(skeleton, np.zeros((1, J, 3)), False)
-    weights = strongest(diffuse_weights(template, skeleton, config.width), config.parts, 1e-3)
+    weights = strongest(diffuse_weights(template, skeleton, WIDTH), CARRIERS, 1e-3)
     return SkinningModel(template, skeleton, template.vertices, weights, constants, np.zeros((0, N, 3), np.float32),
                          template.vertices, np.zeros((0, N, 3), np.float32), np.zeros(0), 0.0,
                          np.zeros((J, 3)), np.zeros((3 * J, 3 * J)))
@@ -150,7 +145,7 @@ def _start(template: Mesh, skeleton: Skeleton, config: SkinConfig) -> SkinningMo
 def _learn_pose(model: SkinningModel, poses: np.ndarray, bodies: np.ndarray, config: SkinConfig, share: float,
                 work: ProgressShares) -> tuple[SkinningModel, np.ndarray]:
     """Fit poses, weights, joints, rest vertices and correctives in turn, while the left-out error falls."""
-    allowed = diffuse_weights(model.template, model.skeleton, 2 * config.width) > 0
+    allowed = diffuse_weights(model.template, model.skeleton, 2 * WIDTH) > 0
     model = replace(model, info={"left_out_error": np.inf})
     for k in range(config.rounds):
         tried, fitted = work.step(f"correctives {config.correctives}, round {k}", (model, poses, bodies, config),
@@ -168,7 +163,7 @@ def _next_round(model: SkinningModel, poses: np.ndarray, bodies: np.ndarray, all
                 work: ProgressShares) -> tuple[SkinningModel, np.ndarray]:
     """Fit poses, weights, joints, rest vertices and correctives, each to the others, once."""
     fitted = fit_poses(model.subject(), bodies, poses, work, QUICK)
-    tried = _with_weights(model, fitted, bodies, allowed, config)
+    tried = _with_weights(model, fitted, bodies, allowed)
     tried = _with_joints(tried, fitted, bodies)
     return _with_correctives(tried, fitted, bodies, config), fitted
 
@@ -182,12 +177,11 @@ def _carry_by_each_part(model: SkinningModel, pose: np.ndarray, body: np.ndarray
     return np.asarray(by_part + (body - np.einsum("np,pnd->nd", model.weights, by_part)).mean(axis=0))
 
 
-def _with_weights(model: SkinningModel, poses: np.ndarray, bodies: np.ndarray, allowed: np.ndarray,
-                  config: SkinConfig) -> SkinningModel:
+def _with_weights(model: SkinningModel, poses: np.ndarray, bodies: np.ndarray, allowed: np.ndarray) -> SkinningModel:
     """Fit the blend weights to the bodies at their poses."""
     carried = [_carry_by_each_part(model, p, y) for p, y in zip(poses, bodies, strict=True)]
     weights = fit_weights(carried, bodies, model.template, model.weights, allowed)
-    return replace(model, weights=strongest(weights, config.parts, 1e-3))
+    return replace(model, weights=strongest(weights, CARRIERS, 1e-3))
 
 
 def _with_joints(model: SkinningModel, poses: np.ndarray, bodies: np.ndarray) -> SkinningModel:

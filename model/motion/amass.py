@@ -39,8 +39,8 @@ def t_pose() -> np.ndarray:
     return np.array([_T_POSE[name] for name in left]) * np.array(mirror)
 
 
-def moving_body(motion: StoredMotion) -> tuple[MovingSkeleton, str]:
-    """Build the 22 joints of the body in a motion of the family, with the T-pose at rest; also return the up axis.
+def moving_body(motion: StoredMotion) -> MovingSkeleton:
+    """Build the 22 joints of the body in a motion of the family, with the T-pose at rest.
 
     The axes are turned so that y is up.
     """
@@ -54,7 +54,7 @@ def moving_body(motion: StoredMotion) -> tuple[MovingSkeleton, str]:
     U = turn_up(up)
     offsets = rest - np.where(PARENTS[:, None] < 0, 0, rest[PARENTS])
     places = joint_places(tree, motion.poses[:, :BODY], motion.trans - rest[0]) @ U.T
-    return MovingSkeleton(NAMES, PARENTS, offsets, {}, U @ R, places, motion.rate), "xyz"[up]
+    return MovingSkeleton(NAMES, PARENTS, offsets, {}, U @ R, places, motion.rate)
 
 
 def with_joints(poses: np.ndarray, count: int) -> np.ndarray:

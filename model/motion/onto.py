@@ -121,7 +121,7 @@ def read_motion(path: str | Path, model: BodyModel, subject: Subject | None = No
         if stored.poses.shape[1] < BODY:
             raise StorageError(f"{path}: expected at least the {BODY} joints of the body, "
                                f"found {stored.poses.shape[1]}")
-        return _onto(path, moving_body(stored)[0], model, subject, UNCERTAIN, stored.gender)
+        return _onto(path, moving_body(stored), model, subject, UNCERTAIN, stored.gender)
     check_ours(path, stored)
     if stored.skeleton is not None and not same_skeleton(stored.skeleton, model.skeleton):
         moving = set_in_motion(stored.skeleton, stored.poses, stored.trans, stored.rate)

@@ -2,15 +2,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
-from typing import Annotated, Literal
+from dataclasses import dataclass, replace
+from typing import Literal
 
 import numpy as np
 
 from scanprep.geometry.landmarks import match_landmarks
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.surface import check_points, check_surface
-from scanprep.ranges import FLAG, Settings
 from scanprep.registration.nonrigid import Registration, register
 from scanprep.registration.schedule import RegistrationConfig
 
@@ -18,23 +17,10 @@ from ..body import BodyModel, Progress
 from ..linear import check_pose
 from ..shape_statistics import PLANE
 
-
-@dataclass(frozen=True)
-class CharacterConfig(Settings):
-    """Settings of `character_model`.
-
-    Attributes
-    ----------
-    pose : "found" or "rest"
-        "found" estimates the character's pose from the mesh and undoes it. "rest" assumes the template's pose, so parts
-        that look rotated have that shape.
-    """
-
-    pose: Annotated[Literal["found", "rest"], FLAG] = "found"
+Pose = Literal["found", "rest"]
 
 
-def character_model(model: BodyModel, vertices: np.ndarray, config: CharacterConfig | None = None,
-                    pose: np.ndarray | None = None) -> BodyModel:
+def character_model(model: BodyModel, vertices: np.ndarray, pose: np.ndarray | Pose = "found") -> BodyModel:
     """Build a model with a character in place of its mean person.
 
     Shape components, pose-dependent deformation and pose prior stay. Betas are then offsets from the character, whose
@@ -46,10 +32,9 @@ def character_model(model: BodyModel, vertices: np.ndarray, config: CharacterCon
         A model with betas.
     vertices : (N, 3) float, metres
         The character in the triangles of the model's template, anywhere.
-    config : CharacterConfig, optional
-        Settings.
-    pose : (J, 3) float, radians, optional
-        The pose of the character, where it is known.
+    pose : (J, 3) float, radians, or "found" or "rest"
+        The pose of the character, where it is known. "found" estimates it from the vertices and undoes it. "rest"
+        assumes the template's pose, so parts that look rotated have that shape.
 
     Raises
     ------
@@ -58,43 +43,26 @@ def character_model(model: BodyModel, vertices: np.ndarray, config: CharacterCon
 
     [MoSh]
     """
-    config = config or CharacterConfig()
     vertices = np.asarray(vertices, dtype=np.float64)
     if vertices.shape != model.template.vertices.shape or not np.isfinite(vertices).all():
         raise ValueError(f"vertices: expected finite numbers of shape {model.template.vertices.shape}, "
                          f"got shape {vertices.shape}")
     if not model.n_betas:
         raise ValueError("model: it has no betas, so no mean person to put a character in the place of")
-    if pose is None:
-        pose = character_pose(model, vertices, config)
+    if isinstance(pose, str):
+        pose = character_pose(model, vertices, pose)
     pose, _ = check_pose(model.skeleton, pose, None)
     found = model.recentre(vertices, pose)
     kept = {name: value for name, value in model.info.items() if name != PLANE}   # these betas are nobody's
     return replace(found, info={**kept, "character": True})                      # type: ignore[type-var]
 
 
-def character_pose(model: BodyModel, vertices: np.ndarray, config: CharacterConfig) -> np.ndarray:
-    """Estimate the pose (J, 3) of a character relative to the template, radians."""
+def character_pose(model: BodyModel, vertices: np.ndarray, pose: Pose) -> np.ndarray:
+    """Estimate the pose (J, 3) of a character relative to the template, radians, as for `character_model`."""
     R = model.skeleton.fit_rotations(model.template, vertices)
-    if config.pose == "rest":
+    if pose == "rest":
         R[:] = R[0]
     return model.skeleton.pose_of(R)
-
-
-@dataclass(frozen=True)
-class CharacterMeshConfig(Settings):
-    """Settings of `register_character`.
-
-    Attributes
-    ----------
-    register : RegistrationConfig
-        Of every round.
-    character : CharacterConfig
-        How the character becomes the mean of the model.
-    """
-
-    register: RegistrationConfig = field(default_factory=RegistrationConfig)
-    character: CharacterConfig = field(default_factory=CharacterConfig)
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,17 +83,16 @@ class Character:
 
 
 def register_character(model: BodyModel, mesh: Mesh, landmarks: Mapping[str, np.ndarray] | None = None,
-                       template_landmarks: Mapping[str, int] | None = None, config: CharacterMeshConfig | None = None,
-                       progress: Progress | None = None) -> Character:
+                       template_landmarks: Mapping[str, int] | None = None, config: RegistrationConfig | None = None,
+                       progress: Progress | None = None, pose: Pose = "found") -> Character:
     """Make a model of a character from its mesh: register the template to it, then `character_model`.
 
     The mesh has any size, place and direction, and is about in the template's pose; a mesh with the template's
     triangles is taken as it is. A dozen landmarks spread over the body are enough: tips of hands and feet, elbows,
-    knees, head, trunk. ValueError for fewer than four of the same names.
+    knees, head, trunk. `pose` is that of `character_model`. ValueError for fewer than four of the same names.
 
     [MoSh]
     """
-    config = config or CharacterMeshConfig()
     fit = None
     if np.array_equal(mesh.faces, model.template.faces):
         body = mesh
@@ -135,15 +102,14 @@ def register_character(model: BodyModel, mesh: Mesh, landmarks: Mapping[str, np.
         _, vertices, points = match_landmarks(known, landmarks or {}, minimum=4)
         fit = _register_character(model.template, mesh, vertices.astype(np.int64), points, config, progress)
         body = fit.mesh
-    pose = character_pose(model, body.vertices, config.character)
-    found = character_model(model, body.vertices, config.character, pose)
+    turns = character_pose(model, body.vertices, pose)
+    made = character_model(model, body.vertices, turns)
     joints = model.joint_regressor @ body.vertices
-    return Character(found, body, pose, joints, points_inside(body, joints), fit)
+    return Character(made, body, turns, joints, points_inside(body, joints), fit)
 
 
 def _register_character(template: Mesh, mesh: Mesh, vertices: np.ndarray, points: np.ndarray,
-                        config: CharacterMeshConfig,
-                        progress: Progress | None) -> Registration:
+                        config: RegistrationConfig | None, progress: Progress | None) -> Registration:
     """Register the template to the mesh, scaled by the landmarks, in two passes."""
     report_progress = progress or (lambda done, total: None)
     size = _spread(template.vertices[vertices]) / _spread(points)
@@ -154,7 +120,7 @@ def _register_character(template: Mesh, mesh: Mesh, vertices: np.ndarray, points
         def told(done: int, total: int, before: int = k) -> None:
             report_progress(before * total + done, registrations * total)
 
-        fit = register(start, mesh, (vertices, points), config.register, told)
+        fit = register(start, mesh, (vertices, points), config, told)
         start = fit.mesh
     return fit
 

@@ -16,6 +16,7 @@ from scanprep.geometry.landmarks import read_landmark_vertices, read_landmarks
 from scanprep.geometry.storage import load_arrays, numbers, read_json, taking_apart
 from scanprep.judgement import HAND, Judgement, size
 from scanprep.ranges import BETAS, TURNS, Beta
+from scanprep.registration.schedule import RegistrationConfig
 
 from ..body import BodyModel
 from ..cli import ModelArg, read_body
@@ -26,7 +27,7 @@ from ..linear import Subject
 from ..motion.files import betas_for
 from ..motion.onto import read_motion
 from ..people import ASKED, person_judgement
-from .character import CharacterMeshConfig, character_problem, register_character
+from .character import Pose, character_problem, register_character
 from .transfer import own_body, subject_from_body
 
 BodyArg = Annotated[Path, Place("BODY")]
@@ -62,7 +63,7 @@ def repose(model: ModelArg, body: BodyArg, poses: Annotated[Path, Called("--moti
 
 def character(mesh: MeshArg, model: Annotated[Path, Alias("-m")], output: Output, landmarks: Path | None = None,
               template_landmarks: Path | None = None, unit: Unit | None = None,
-              config: CharacterMeshConfig = CharacterMeshConfig()) -> Outcome:
+              pose: Pose = "found", register: RegistrationConfig = RegistrationConfig()) -> Outcome:
     """A character of any triangles as the mean of a model: it moves as people do, betas are offsets from it.
 
     The template is registered to the character by landmarks of the same names on both, of which a dozen spread over the
@@ -77,7 +78,9 @@ def character(mesh: MeshArg, model: Annotated[Path, Alias("-m")], output: Output
         landmarks: Landmarks of the character; not needed for a mesh with the template's triangles.
         template_landmarks: Landmarks of the template; else those that the model keeps.
         unit: Unit of the character and its landmarks.
-        config: Settings.
+        pose: "found" estimates the character's pose from the mesh and undoes it; "rest" assumes the template's pose,
+            so parts that look rotated have that shape.
+        register: Settings of the registration.
     """
     from scanprep.pictures.shading import save_png
 
@@ -91,7 +94,7 @@ def character(mesh: MeshArg, model: Annotated[Path, Alias("-m")], output: Output
     marks = None if landmarks is None else read_landmarks(landmarks, body, unit)
     ours = None if template_landmarks is None else read_landmark_vertices(template_landmarks, loaded.template)
     with bar("registering") as progress:
-        found = register_character(loaded, body, marks, ours, config, progress)
+        found = register_character(loaded, body, marks, ours, register, progress, pose)
     found.model.save(output)
     save_png(output.with_suffix(".png"), picture_character(found.model))
     rows = [] if found.registration is None else [
@@ -104,7 +107,7 @@ def character(mesh: MeshArg, model: Annotated[Path, Alias("-m")], output: Output
              Metric("joints inside it", f"{found.inside.sum()} of {len(found.inside)}"
                     + (f", outside: {outside}" if outside else "")),
              Metric("most turned joint", float(np.degrees(np.linalg.norm(found.pose[1:], axis=1).max())), "°")]
-    return Outcome(output, rows, {"character": config}, judgement=Judgement.of(
+    return Outcome(output, rows, {"pose": pose, "register": register}, judgement=Judgement.of(
         character_problem(found), [f"outside: {outside}"] if outside else []))
 
 

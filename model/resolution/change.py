@@ -1,7 +1,7 @@
 """Change the resolution of a model: the same model on another triangulation of its template's surface."""
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -11,28 +11,14 @@ from scanprep.geometry.attached import Attached
 from scanprep.geometry.carrier import mount
 from scanprep.geometry.mesh import Mesh, check_template, take_any_mesh
 from scanprep.geometry.surface import Surface
-from scanprep.ranges import Settings
 
 from ..body import BodyModel, Progress
 from .transfer import transfer_skeleton
 
 
-@dataclass(frozen=True)
-class ResolutionConfig(Settings):
-    """Settings of `change_resolution`.
-
-    Parameters
-    ----------
-    rounds : int
-        How often pose space and shape space are corrected; 0 is faster and rougher.
-    """
-
-    rounds: int = 2
-
-
 @take_any_mesh
-def change_resolution(model: BodyModel, template: Mesh, config: ResolutionConfig | None = None,
-                      progress: Progress | None = None) -> BodyModel:
+def change_resolution(model: BodyModel, template: Mesh, rounds: int = 2, progress: Progress | None = None
+                      ) -> BodyModel:
     """Transfer a model to a coarser or finer triangulation, so that pose, betas and trans keep their meaning.
 
     Bent bodies of a skinning model may move some millimetres. Its joints are averages of the vertices within two edges
@@ -44,8 +30,8 @@ def change_resolution(model: BodyModel, template: Mesh, config: ResolutionConfig
         A model of any kind.
     template : Mesh, metres
         Other triangles on the surface of the model's template, in the same place.
-    config : ResolutionConfig, optional
-        Settings.
+    rounds : int
+        How often pose space and shape space are corrected; 0 is faster and rougher.
     progress : callable, optional
         Called as progress(done, total).
 
@@ -63,9 +49,9 @@ def change_resolution(model: BodyModel, template: Mesh, config: ResolutionConfig
     Examples
     --------
     >>> from model import load_built_in_model
-    >>> from model.resolution.change import ResolutionConfig, resample
+    >>> from model.resolution.change import resample
     >>> model = load_built_in_model()
-    >>> coarse = change_resolution(model, resample(model.template, 2000), ResolutionConfig(rounds=0))
+    >>> coarse = change_resolution(model, resample(model.template, 2000), rounds=0)
     >>> len(coarse.template.vertices), coarse.n_betas
     (2000, 30)
 
@@ -75,7 +61,6 @@ def change_resolution(model: BodyModel, template: Mesh, config: ResolutionConfig
     _check_same_surface(model.template, template)
     template = _with_attached(replace(template, up=model.template.up), model.template)
     skeleton = transfer_skeleton(model.skeleton, model.template, template)
-    rounds = (config or ResolutionConfig()).rounds
     moved = model.resample(template, skeleton, rounds, progress or (lambda done, total: None))
     # landmarks on the nearest new vertices; digests of training bodies say nothing of bodies in another topology
     old, marks = model.template, model.info.get("landmarks", {})
@@ -113,11 +98,11 @@ def resolution_gap(model: BodyModel, changed: BodyModel, poses: np.ndarray, beta
     return np.array(gaps)
 
 
-def subdivide_at_middles(mesh: Mesh, times: int = 1) -> Mesh:
+def subdivide_at_middles(mesh: Mesh) -> Mesh:
     """Cut every triangle into four at the middles of its sides; the surface stays the same."""
     import igl
 
-    return Mesh(*igl.upsample(mesh.vertices, mesh.faces, times))
+    return Mesh(*igl.upsample(mesh.vertices, mesh.faces, 1))
 
 
 def resample(mesh: Mesh, vertices: int) -> Mesh:

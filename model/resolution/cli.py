@@ -15,11 +15,11 @@ from scanprep.ranges import Faces
 
 from ..cli import ModelArg
 from ..files import load_model
-from .change import ResolutionConfig, change_resolution, resample, resolution_gap
+from .change import change_resolution, resample, resolution_gap
 
 
 def resample_model(model: ModelArg, output: Output, template: Path | None = None, vertices: Faces | None = None,
-                   unit: Unit | None = None, config: ResolutionConfig = ResolutionConfig()) -> Outcome:
+                   unit: Unit | None = None) -> Outcome:
     """Transfer a model to fewer or more triangles; poses, betas and places keep their meaning.
 
     Example: scape model resample model.npz --vertices 5389 -o coarse.npz
@@ -30,14 +30,13 @@ def resample_model(model: ModelArg, output: Output, template: Path | None = None
         template: Mesh with other triangles on the surface of the model's template.
         vertices: Without a template: how many vertices to decimate or subdivide to.
         unit: Unit of the template.
-        config: Settings.
     """
     if (template is None) == (vertices is None):
         raise UsageError("--template and --vertices: expected one of them")
     loaded = load_model(model)
     mesh = resample(loaded.template, vertices) if vertices is not None else read_mesh(Path(str(template)), unit)
     with bar("transferring the model") as progress:
-        changed = change_resolution(loaded, mesh, config, progress)
+        changed = change_resolution(loaded, mesh, progress=progress)
     changed.save(output)
     rng = np.random.default_rng(1)
     measured = 20  # poses in which the two models are compared
@@ -52,6 +51,6 @@ def resample_model(model: ModelArg, output: Output, template: Path | None = None
         Metric("triangles", len(mesh.faces)),
         *(Metric(f"distance in {measured} random poses, {who}, {what}", 1000.0 * float(value), "mm")
           for who, gap in gaps for what, value in (("mean", gap.mean()), ("worst pose", gap.max())))],
-                   {"resample": config}, judgement=Judgement.of(check=[
+                   judgement=Judgement.of(check=[
             f"{who} in random poses: {1000 * float(gap.mean()):.0f} mm from where it was; take more vertices"
             for who, gap in gaps if gap.mean() > 0.01]))

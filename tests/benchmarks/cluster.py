@@ -28,7 +28,7 @@ from protocols import machine, write_report
 from completion import read_markers, write_markers
 from model import load_model
 from model.built_in import load_built_in_model
-from model.resolution.change import ResolutionConfig, change_resolution
+from model.resolution.change import change_resolution
 from scanprep import decimate, write_landmarks, write_mesh
 from scanprep.geometry.mesh import Mesh
 from scanprep.synthetic.people import synthesise_walk
@@ -46,7 +46,7 @@ def write_inputs(folder: Path, different: int, frames: int) -> None:
     rng, whole = np.random.default_rng(0), load_built_in_model()
     names = list(whole.info["landmarks"])[:MARKS]
     marks = np.array([whole.info["landmarks"][name] for name in names])
-    coarse = change_resolution(whole, decimate(whole.template, FACES, keep=marks), ResolutionConfig(rounds=0))
+    coarse = change_resolution(whole, decimate(whole.template, FACES, keep=marks), rounds=0)
     coarse.save(folder / "model.npz")
     for number in range(different):
         poses, trans = synthesise_walk(FRAMES, RATE)

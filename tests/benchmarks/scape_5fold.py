@@ -78,8 +78,8 @@ def run(learn: Learn, template: Mesh, training: np.ndarray, held: np.ndarray, sk
         model.save(keep)
     fitter = PoseFitter(model.subject())
     errors = [1e3 * fitter.fit(body).mean for body in held]
-    return {"error_mm": np.round(errors, 2).tolist(), "features": model.n_features,
-            "terms": model.terms.count if hasattr(model, "terms") else model.n_features, "learn_s": learned - start,
+    return {"error_mm": np.round(errors, 2).tolist(), "features": model.features.count,
+            "terms": model.terms.count if hasattr(model, "terms") else model.features.count, "learn_s": learned - start,
             "fit_s_per_pose": (time.perf_counter() - learned) / len(held),
             "chosen": {k: v for k, v in model.info.items() if isinstance(v, float | int | str) and k != "digest"}}
 

@@ -61,10 +61,10 @@ def learning(report: dict) -> str:
                                                    ("loading it (s)", "load_s"),
                                                    ("memory of the loaded model (MiB)", "loaded_mib")) if key in report]
     rows += [(f"fast path: {name}", value) for name, value in flat(report["fast_path"])]
-    people = [tuple(row[n] for n in ("components", "people", "mean_mm", "worst_person_mm", "pose_held_mm",
+    people = [tuple(row[n] for n in ("components", "people", "mean_mm", "worst_person_mm",
                                      "vertex_pca_mm", "fit_s")) for row in report["people"]]
     return table(("", ""), rows) + "\n\n" + table(
-        ("components", "held-out people", "mean error (mm)", "worst person (mm)", "pose held (mm)",
+        ("components", "held-out people", "mean error (mm)", "worst person (mm)",
          "plain vertex PCA (mm)", "fit (s)"), people)
 
 

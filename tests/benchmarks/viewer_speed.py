@@ -59,7 +59,7 @@ def measure(model: BodyModel, seconds: float) -> dict[str, Any]:
 
     app = ViewApp([Entry("model", lambda: of_model("model", model))])
     path = next(filter(None, map(shutil.which, NAMES)))
-    out: dict[str, Any] = {"vertices": len(model.template.vertices), "features": model.n_features}
+    out: dict[str, Any] = {"vertices": len(model.template.vertices), "features": model.features.count}
     with Server(app) as server, sync_playwright() as started:
         browser = started.chromium.launch(executable_path=path, args=list(FLAGS))
         page = browser.new_context(bypass_csp=True).new_page()

@@ -56,7 +56,7 @@ def read_statue_motion(statue: Statue, path: Path, rate: float | None = None) ->
         moving = set_in_motion(stored.skeleton, stored.poses, stored.trans, stored.rate)
         return _with_file_name(path, bvh_motion, control, statue.pose, moving), []
     if stored.of_family:
-        return _with_file_name(path, bvh_motion, control, statue.pose, moving_body(stored)[0]), []
+        return _with_file_name(path, bvh_motion, control, statue.pose, moving_body(stored)), []
     # files of older versions and of other programs do not hold their skeleton: only the kind and the count say whose
     # they are
     count, own, people = stored.poses.shape[1], len(parts.parents), 16
