@@ -7,7 +7,7 @@ from derivatives import differences
 from trimesh.remesh import subdivide_to_size
 
 from model.statue.control.files import humanoid
-from model.statue.fit import StatueConfig, pose_automatically, pose_by_features
+from model.statue.fit import pose_automatically, pose_by_features
 from model.statue.registration import automatic
 from model.statue.registration.articulated import Articulated, BoundPoints
 from model.statue.registration.automatic import Features, find_features, person_unit
@@ -206,10 +206,10 @@ def test_features_that_were_found_pose_and_warp_as_those_that_were_clicked(contr
     clicked = pose_by_features(control, joints, points)
     on_scan = control.mesh.with_vertices(clicked.features.vertices + [0.0, 0.0, 0.01])
     found = Features(joints, points, (), on_scan, clicked.features, None)
-    published = pose_automatically(control, found, StatueConfig.from_paper().start == "registered")
+    published = pose_automatically(control, found, registered=False)
     np.testing.assert_array_equal(published.start, clicked.start)
     assert published.face == len(FACE) and np.abs(published.start - clicked.features.vertices).max() > 0.01
-    usual = pose_automatically(control, found, StatueConfig().start == "registered")
+    usual = pose_automatically(control, found)
     np.testing.assert_array_equal(usual.start, on_scan.vertices)
     hidden = pose_automatically(control, Features(joints, points, ("skullbase",), on_scan, clicked.features, None))
     head = head_share(control) == 1
