@@ -28,10 +28,7 @@ from scanprep.geometry.landmark_names import FACE
 from scanprep.geometry.landmarks import read_landmarks
 from scanprep.pipeline.scans import ScanTask
 from scanprep.synthetic.people import LANDMARKS, BodyShape, SyntheticPerson, synthesise_walk
-from scanprep.viewer.clicked import Clicked
-from scanprep.viewer.joints import JointApp
 from scanprep.viewer.landmark_names import HUMANOID
-from scanprep.viewer.messages import Message
 
 JOINTS = {"vl5": 1, "skullbase": 3, "l_shoulder": 4, "l_elbow": 5, "l_wrist": 6, "r_shoulder": 7, "r_elbow": 8,
           "r_wrist": 9, "l_hip": 10, "l_knee": 11, "l_ankle": 12, "r_hip": 13, "r_knee": 14, "r_ankle": 15}
@@ -253,23 +250,6 @@ def test_a_statue_leaves_its_joints_to_be_mended_in_the_unit_of_its_scan(made, p
     assert np.linalg.norm(joints["l_elbow"] - person.joints[JOINTS["l_elbow"]]) < 0.02
 
 
-def test_joints_clicked_from_the_front_fit_a_figure_without_a_unit(person, tmp_path, monkeypatch):
-    """The whole road: a refused figure of a person in millimetres is clicked, saved, and fitted by that file."""
-    scan = tmp_path / "anna.ply"
-    write_mesh(scan, person.mesh.with_vertices(1000 * person.mesh.vertices))
-    app = JointApp(Clicked(scan, tmp_path / "anna.features.json", "m"), HUMANOID, FACE)
-    for name, j in JOINTS.items():
-        if name not in ("vl5", "skullbase"):
-            ray = {"origin": (1000 * person.joints[j] - [0, 3000, 0]).tolist(), "direction": [0, 1, 0]}
-            app.handle(Message("place", {"pane": 0, "name": name, **ray}), lambda message: None)
-    kept = {}
-    monkeypatch.setattr(commands, "fit_statue", lambda scan, joints, points, *more: kept.update(joints) or refuse())
-    assert run("fit", scan, "-o", tmp_path / "statue", "--features", tmp_path / "anna.features.json") == 1
-    off = {name: 1000 * np.linalg.norm(place - person.joints[JOINTS[name]]) for name, place in kept.items()}
-    hips = [off.pop("l_hip"), off.pop("r_hip")]
-    assert len(off) == 10 and max(off.values()) < 15 and max(hips) < 25, (off, hips)
-
-
 def refuse(joints=None):
     """What a figure in which nobody was found ends with."""
     raise UnplacedError("scan: nobody", Features(joints or {}, {}, (), None, None, "nobody"))
@@ -298,13 +278,3 @@ def test_a_refused_figure_opens_with_what_was_found_and_may_be_fitted_there(pers
 def test_the_names_offered_to_be_clicked_are_those_of_the_humanoid():
     control = humanoid()
     assert set(HUMANOID) == {*control.skeleton.names[1:], *FACE} and set(FACE) <= set(control.landmarks)
-
-
-def test_a_part_of_a_person_is_sought_in_the_unit_of_its_file_too(person, tmp_path, monkeypatch):
-    upper = person.mesh.submesh(person.mesh.corners[:, :, 2].min(axis=1) > 0.9)[0]
-    write_mesh(tmp_path / "half.ply", upper)
-    heights = []
-    monkeypatch.setattr(commands, "fit_statue",
-                        lambda scan, *more: heights.append(np.ptp(scan.vertices[:, 2])) or refuse())
-    assert run("fit", tmp_path / "half.ply", "-o", tmp_path / "statue") == 1
-    assert heights == pytest.approx([1.7, np.ptp(upper.vertices[:, 2])], abs=0.1)

@@ -1,7 +1,7 @@
 """Normal volume, displacement map, subdivision and reconstruction, on spheres whose heights are known."""
 import json
 from dataclasses import replace
-from itertools import pairwise, product
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -25,7 +25,7 @@ from model.statue.detail.reconstruction import (
     remaining_error,
 )
 from model.statue.detail.subdivision import INNER, chart_places, subdivide_adaptive, subdivide_uniform
-from model.statue.detail.texels import bake_texture, continue_chart, find_texels, scan_look, vertex_of_row
+from model.statue.detail.texels import bake_texture, continue_chart, find_texels, scan_look
 from model.statue.fit import StatueConfig
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.storage import StorageError
@@ -63,18 +63,6 @@ def places(control):
     return texels, *interpolate(control.mesh, texels.faces, texels.bary)
 
 
-def slowly(mesh, points, reach):
-    """Least height of each point over all triangles, by numpy's roots of a fitted cubic."""
-    out, at = np.full(len(points), np.inf), np.linspace(-1, 1, 4)
-    for face, (i, p) in product(mesh.faces, enumerate(points)):
-        v, n = mesh.vertices[face], mesh.vertex_normals[face]
-        for d in reach * np.roots(np.polyfit(at, [np.linalg.det(v - p + reach * x * n) for x in at], 3)):
-            b = np.linalg.lstsq(np.vstack([(v + d.real * n).T, np.ones(3)]), np.r_[p, 1], rcond=None)[0]
-            if abs(d.imag) < 1e-9 * reach and abs(d) <= reach and (b > -1e-7).all():
-                out[i] = min(out[i], abs(d))
-    return out
-
-
 def test_points_come_back_from_the_normal_volume(control):
     rng = np.random.default_rng(0)
     p, faces, bary = control.mesh.sample(3000, rng)
@@ -90,19 +78,6 @@ def test_points_come_back_from_the_normal_volume(control):
     np.testing.assert_allclose(found.bary[same], bary[same], atol=1e-8)
     middle = to_normal_volume(globe(6, 8, 0.05)[0], np.zeros((1, 3)) + 0.003, 0.06)
     assert middle.solutions[0] > 1                           # amid a ring it is reached from several triangles
-
-
-def test_the_least_height_over_all_triangles_is_found():
-    rng = np.random.default_rng(1)
-    small, _ = globe(5, 6, 0.1)
-    crooked = small.with_vertices(small.vertices + 0.015 * rng.normal(size=small.vertices.shape))
-    points = rng.uniform(-0.15, 0.15, (40, 3))
-    found, slow = to_normal_volume(crooked, points, 0.06), slowly(crooked, points, 0.06)
-    upright = found.inside                                   # the slow way takes turned-over triangles too
-    assert (np.abs(found.heights[upright]) >= slow[upright] - 1e-9).all()
-    assert np.mean(np.abs(np.abs(found.heights[upright]) - slow[upright]) < 1e-9) > 0.8
-    assert np.isinf(slow).any() and not found.inside[np.isinf(slow)].any()
-    assert np.isnan(found.heights[~found.inside]).all() and not found.solutions[~found.inside].any()
 
 
 def test_inside_a_flat_body_the_nearer_side_is_taken_and_the_other_one_is_the_limit():
@@ -146,22 +121,6 @@ def test_both_ways_to_the_map_agree(control, scan, fine_map):
     heights = bilinear(fine_map.heights, chart_places(control.chart, there.faces, there.bary))
     np.testing.assert_allclose(heights, there.heights, atol=1e-4)
     assert rms(remaining_error(control, fine_map, scan)) < 3e-5
-
-
-def test_the_map_goes_on_across_the_seam(control, fine_map):
-    """The same places of the seam read from either side of the chart."""
-    flat, mesh = control.chart.flat, control.mesh
-    border = flat.edges[flat.edge_use == 1]
-    t, vertex = np.linspace(0, 1, 7), vertex_of_row(mesh, control.chart)
-
-    def along(values):
-        return np.concatenate([(1 - x) * values[border[:, 0]] + x * values[border[:, 1]] for x in t])
-    at, heights = along(mesh.vertices[vertex]), bilinear(fine_map.heights, along(control.chart.uv))
-    assert len(np.unique(np.sort(vertex[border], axis=1), axis=0)) == len(border) // 2
-    nearest = np.linalg.norm(at[:, None] - at[None], axis=2) + np.eye(len(at))
-    other = nearest.argmin(axis=1)
-    np.testing.assert_allclose(nearest.min(axis=1), 0, atol=1e-12)
-    assert np.abs(heights - heights[other]).max() < 2e-4                 # of 10 mm, at pixels of 1 mm
 
 
 def test_beside_the_chart_the_surface_goes_on(control):

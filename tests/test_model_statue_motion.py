@@ -25,7 +25,6 @@ from model.statue.motion.motions import (
 )
 from scanprep.geometry import rotations
 from scanprep.geometry.storage import StorageError
-from scanprep.skeleton.roles import find_roles, trunk
 from scanprep.skeleton.tree import Skeleton
 from scanprep.synthetic.people import PARTS, SyntheticPerson, find_pose, synthesise_walk
 
@@ -144,21 +143,7 @@ MAX = {"humanoid_root": "Hips", "vl5": "Chest", "skullbase": "Head",
        **{f"{s}_{ours}": f"{side}{theirs}" for s, side in (("l", "Left"), ("r", "Right")) for ours, theirs in
           (("sternoclavicular", "Collar"), ("shoulder", "Shoulder"), ("elbow", "Elbow"), ("wrist", "Wrist"),
            ("hip", "Hip"), ("knee", "Knee"), ("ankle", "Ankle"))}}
-BIPED = {"humanoid_root": "Bip01 Pelvis", "vl5": "Bip01 Spine", "skullbase": "Bip01 Head",
-         **{f"{s}_{ours}": f"Bip01 {s.upper()} {theirs}" for s in "lr" for ours, theirs in
-            (("sternoclavicular", "Clavicle"), ("shoulder", "UpperArm"), ("elbow", "Forearm"), ("wrist", "Hand"),
-             ("hip", "Thigh"), ("knee", "Calf"), ("ankle", "Foot"))}}
-SIDE_LAST = {"humanoid_root": "pelvis", "vl5": "spine_01", "skullbase": "head",
-             **{f"{s}_{ours}": f"{theirs}_{s}" for s in "lr" for ours, theirs in
-                (("sternoclavicular", "clavicle"), ("shoulder", "upperarm"), ("elbow", "lowerarm"), ("wrist", "hand"),
-                 ("hip", "thigh"), ("knee", "calf"), ("ankle", "foot"))}}
 HANIM = {name: name for name in NAMES}
-
-
-@pytest.mark.parametrize("table", [MIXAMO, MAX, BIPED, SIDE_LAST, HANIM])
-def test_names_of_other_programs(table):
-    names = [*table.values(), "Neck", "LeftToeBase", "LHipJoint", "rThumb1", "LeftForeArmRoll"]
-    assert find_roles(names) == {role: k for k, role in enumerate(table)}
 
 
 def in_t_pose(poses, table, Q, size=1.0):
@@ -211,27 +196,6 @@ def test_a_motion_comes_back_from_another_rest_pose_and_other_axes(table, Q):
         bvh_motion(control, GENERIC, odd)
 
 
-def test_feet_are_flat_at_rest_or_square_to_legs_that_are_apart():
-    still = np.zeros((1, 17, 3))
-    for apart in (0.05, 0.3):
-        bvh = in_t_pose(still, MIXAMO, Y_UP)
-        shanks = {bvh.names.index(MIXAMO[f"{side}_ankle"]): sign for side, sign in (("l", 1), ("r", -1))}
-        offsets = bvh.offsets.copy()
-        for ankle, sign in shanks.items():
-            offsets[ankle] = np.linalg.norm(offsets[ankle]) * np.array([sign * np.sin(apart), -np.cos(apart), 0])
-        found = bvh_motion(humanoid(), GENERIC, replace(bvh, offsets=offsets))
-        R = world(humanoid(), found)[0]
-        for name, sign in (("l_ankle", 1), ("r_ankle", -1)):
-            tilt = sign * (apart if apart > 0.1 else 0)
-            assert np.abs(R[NAMES.index(name)] - rotations.exp(np.array([0, -tilt, 0]))).max() < 1e-9
-
-
-def test_a_file_whose_rest_says_nothing_is_refused():
-    bvh = in_t_pose(np.zeros((1, 17, 3)), MIXAMO, Y_UP)
-    with pytest.raises(ValueError, match="not in one line at rest"):
-        bvh_motion(humanoid(), GENERIC, replace(bvh, offsets=np.linalg.norm(bvh.offsets, axis=1)[:, None] * [1, 0, 0]))
-
-
 def test_a_bvh_that_was_exported_drives_the_statue(tmp_path):
     control, person = humanoid(), SyntheticPerson()
     poses, trans = synthesise_walk(12, 12)
@@ -242,13 +206,6 @@ def test_a_bvh_that_was_exported_drives_the_statue(tmp_path):
     angles = np.degrees(np.linalg.norm(rotations.log(turned), axis=-1))
     assert angles.max() < 5, "the rest poses differ by as much as the two skeletons do"
     assert np.abs(found.trans - direct.trans).max() < 0.02
-
-
-def test_a_trunk_is_found_by_the_tree():
-    names = ("Hips", "LowerBack", "Spine", "Spine1", "Neck", "Head", "LeftArm", "RightArm", "LeftUpLeg")
-    parents = np.array([-1, 0, 1, 2, 3, 4, 3, 3, 0])
-    assert trunk(parents, find_roles(names)) == (1, 3)
-    assert trunk(np.array([-1, 0, 1, 2, 3, 4, 0, 0, 0]), find_roles(names)) == (0, 0)
 
 
 def statue_of(control, pose=GENERIC):
