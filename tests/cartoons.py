@@ -19,39 +19,16 @@ FINGERS = ((0.30, 1.00, 0.30), (0.0, 1.10, 0.31), (-0.30, 0.95, 0.29))    # acro
 
 @dataclass(frozen=True)
 class CartoonShape:
-    """Proportions of a figure; all but the first are shares of its height.
-
-    Attributes
-    ----------
-    height : float, metres
-    legs : float
-        Height of the hips.
-    head : float
-        Radius of the head.
-    neck : float
-        Length of the neck that is seen.
-    belly : float
-        Radius of the belly.
-    chest : float
-        Radius of the chest.
-    shoulders : float
-        From the middle to a shoulder.
-    arms : float
-        From shoulder to wrist.
-    limbs : float
-        Radius of arms and legs.
-    hands, feet : float
-        Length of a hand and of a foot.
-    """
+    """Proportions of a figure; all but the first are shares of its height."""
 
     height: float = 1.35
-    legs: float = 0.34
-    head: float = 0.155
-    neck: float = 0.025
-    belly: float = 0.15
+    legs: float = 0.34               # height of the hips
+    head: float = 0.155              # radius
+    neck: float = 0.025              # what is seen of it
+    belly: float = 0.15              # radius, as of chest and limbs
     chest: float = 0.11
-    shoulders: float = 0.13
-    arms: float = 0.33
+    shoulders: float = 0.13          # from the middle to a shoulder
+    arms: float = 0.33               # from shoulder to wrist
     limbs: float = 0.036
     hands: float = 0.19
     feet: float = 0.19
@@ -65,19 +42,7 @@ CARTOONS = {
 
 @dataclass(frozen=True, eq=False)
 class Cartoon:
-    """A cartoon figure.
-
-    Attributes
-    ----------
-    mesh : Mesh
-        Closed, with triangles of its own.
-    landmarks : {name: (3,) float, metres}
-        On its skin, named as those of the synthetic people.
-    joints : {name: (3,) float, metres}
-        Where it bends, named as the parts of the synthetic people that turn there.
-    field : function of points (n, 3), metres
-        Nought on its skin, negative inside: what the mesh has on its corners, up to the steps of the grid.
-    """
+    """A cartoon figure: closed, with landmarks on its skin, joints, and the field that is nought on its skin."""
 
     mesh: Mesh
     landmarks: dict[str, np.ndarray]
@@ -88,17 +53,8 @@ class Cartoon:
 def cartoon(shape: CartoonShape | str = "gnome", step: float = 0.008) -> Cartoon:
     """Make a cartoon figure.
 
-    Parameters
-    ----------
-    shape : CartoonShape or str
-        Or a name of `CARTOONS`: a gnome of big head, hands and belly on short legs, a tall thin beanpole.
-    step : float
-        Spacing of the grid on which its surface is sought, as a share of its height.
-
-    Raises
-    ------
-    ValueError
-        An unknown name.
+    `shape` may be a name of `CARTOONS`; `step` is the spacing of the grid on which its surface is sought, as a share of
+    its height.
     """
     if isinstance(shape, str):
         if shape not in CARTOONS:

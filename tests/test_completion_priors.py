@@ -1,9 +1,8 @@
 import numpy as np
 import pytest
 
-from model.fitting import energy
 from model.fitting.limbs import runs_without_branch
-from model.priors import FLOOR, JointLimits, gaussian_prior, typical_poses
+from model.priors import FLOOR, gaussian_prior, typical_poses
 
 EXAMPLES = np.random.default_rng(7).normal(0, 0.4, (12, 4, 3)) * (np.arange(4) > 0)[:, None]
 
@@ -59,14 +58,3 @@ def test_limbs_are_runs_without_a_branch():
     assert runs_without_branch(np.array([-1, 0, 1, 0, 1, 4, 5])) == [[1], [2], [3], [4, 5, 6]]
 
 
-def test_joint_limits_begin_beyond_what_was_seen():
-    """Each joint about one axis: what is beyond the widest pose and the slack costs one at `GIVE`."""
-    poses = np.zeros((12, 4, 3))
-    poses[:, 1:, 1] = EXAMPLES[:, 1:, 1]
-    limits = JointLimits.from_poses(poses, 1.0, 0.1)
-    x = poses.reshape(12, -1)
-    assert energy.joint_limits(x, limits).energy.max() == 0
-    far = x[poses[:, 1, 1].argmax()].copy()
-    far[:3] = 1.0                                                        # the root rotates freely
-    far[4] += 0.1 + energy.GIVE
-    assert energy.joint_limits(far, limits).energy == pytest.approx(1)

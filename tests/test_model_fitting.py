@@ -91,14 +91,6 @@ def test_shape_with_fewer_components(model):
     assert fit.betas[0] == pytest.approx(1.5, abs=1e-3)
 
 
-def test_spread_vertices_cover_the_body(model):
-    chosen = spread_vertices(model.template.vertices, 40)
-    assert len(np.unique(chosen)) == 40
-    gap = np.linalg.norm(model.template.vertices[:, None] - model.template.vertices[chosen], axis=2).min(axis=1)
-    assert gap.max() < 0.2                                   # 40 discs of 20 cm cover 1.7 m² several times
-    np.testing.assert_array_equal(spread_vertices(model.template.vertices, 10**6), np.arange(398))
-
-
 @pytest.mark.parametrize("vertices, word", [(np.zeros((5, 3)), "shape"), (np.full((398, 3), np.nan), "finite")])
 def test_refuses_bad_vertices(model, vertices, word):
     with pytest.raises(ValueError, match=word):

@@ -3,7 +3,7 @@ import pytest
 from completion_bodies import worm_with_prior
 from scipy.sparse import csr_array
 
-from model.fitting.free_surface import FreeSurface, edge_matrix
+from model.fitting.free_surface import FreeSurface
 from model.gradients import edges
 
 RNG = np.random.default_rng(0)
@@ -12,13 +12,6 @@ RNG = np.random.default_rng(0)
 @pytest.fixture(scope="module")
 def body():
     return worm_with_prior()
-
-
-def test_edge_matrix_is_the_matrix_of_stitching(body):
-    faces, n = body.template.faces, len(body.template.vertices)
-    y = RNG.normal(size=(n, 3))
-    difference = edges(y, faces)
-    np.testing.assert_allclose(np.einsum("nd,nd->", y, edge_matrix(faces, n) @ y), (difference**2).sum())
 
 
 def test_the_free_surface_minimises_equation_10(body):
@@ -43,13 +36,6 @@ def test_the_free_surface_minimises_equation_10(body):
     A = np.vstack([G, np.sqrt(w)[:, None] * C.toarray()])
     dense = np.linalg.lstsq(A, np.vstack([wanted.reshape(-1, 3), np.sqrt(w)[:, None] * z]), rcond=None)[0]
     np.testing.assert_allclose(got, dense, atol=1e-7)
-
-
-def test_without_data_the_free_surface_is_the_model(body):
-    predicted = body.vertices(np.zeros((4, 3)))
-    none = csr_array((0, len(predicted)))
-    np.testing.assert_array_equal(FreeSurface(body.template).solve(predicted, none, np.zeros((0, 3)), np.zeros(0)),
-                                  predicted)
 
 
 def test_data_moved_as_one_move_the_whole_surface(body):

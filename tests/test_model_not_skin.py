@@ -13,17 +13,12 @@ from completion.partial.completion import (
 )
 from completion.partial.masks import read_mask
 from model import find_tapes, load_built_in_model, measure
-from model.fitting import not_skin
 from model.fitting.bodies import as_body
-from model.fitting.hems import find_hems, find_limbs, has_cuffs
+from model.fitting.hems import find_limbs, has_cuffs
 from model.fitting.inside import reach_farther
 from model.fitting.not_skin import (
-    CLOSE,
     NotSkin,
     find_backs,
-    find_facing_skin,
-    find_joined,
-    find_limb_roots,
     find_not_skin,
 )
 from model.fitting.scan import prepare_scan
@@ -94,17 +89,6 @@ def test_clothes_that_are_close_are_told_by_their_hems(parts, told):
         assert worn.sewn[np.isin(KINDS[PART], parts)].mean() > 0.9 and not worn.sewn[KINDS[PART] == "hand"].any()
 
 
-def test_limbs_of_other_parts_have_no_hems():
-    """A skeleton without shins, as one of few parts has."""
-    kinds = np.where(KINDS == "shin", "foot", KINDS)
-    assert len(find_limbs(BODY, MODEL.skeleton, KINDS, "foot")) == 2
-    assert not find_limbs(BODY, MODEL.skeleton, kinds, "foot")
-    faces, bary = np.arange(len(BODY.faces)), np.full((len(BODY.faces), 3), 1 / 3)
-    for found_skin in (*find_hems(BODY, MODEL.skeleton, kinds, faces, bary, 0.0 * faces),
-                       *find_backs(BODY, PART, kinds)):
-        assert not found_skin.any()
-
-
 def test_boots_begin_with_a_step_outward():
     """They hide shins, and what is above them is skin; the same step at the thighs is none of theirs."""
     foot, knee = (BODY.vertices[KINDS[PART] == "shin", 2].min() + z for z in (0.0, 0.40))
@@ -127,15 +111,6 @@ def test_cuffs_are_edges_at_both_wrists_however_askew(thick, told):
     assert has_cuffs(BODY, MODEL.skeleton, KINDS, faces, bary, np.fmax(left, right)) == told
     # one sleeve is a bandage
     assert not has_cuffs(BODY, MODEL.skeleton, KINDS, faces, bary, left)
-
-
-def test_a_suit_as_close_as_skin_is_told_and_masks_nothing(monkeypatch):
-    """Nobody knows where the skin is inside; what else is found later does not hide it."""
-    monkeypatch.setattr(not_skin, "has_cuffs", lambda *ends: True)
-    worn = found(BODY)
-    assert worn.places == (CLOSE,) and not worn.points.any() and not worn.vertices.any()
-    hair = NotSkin(KINDS[PART] == "head", worn.points, ("hair on head",), worn.sewn)
-    assert worn.with_more(hair, BODY, MODEL.skeleton).places == ("hair on head", CLOSE)
 
 
 def test_errors_are_wider_under_suits():
@@ -201,31 +176,6 @@ def test_less_is_told_behind_than_in_front(turn, told):
     side = np.clip(4 * turn * BODY.vertex_normals @ [0, 1, 0], 0, 1) * np.isin(KINDS[PART], ["head", "chest"])
     worn = found(BODY.with_vertices(BODY.vertices + 0.015 * side[:, None] * BODY.vertex_normals))
     assert (worn is not None) == told
-
-
-def test_points_are_joined_by_chains():
-    """Two points 5 mm from the first one, one beyond a gap, and a single point alone."""
-    cloud = prepare_scan(np.hstack([np.arange(40)[:, None] * [0.005, 0, 0] + np.arange(40)[:, None] // 20 * [0.1, 0, 0],
-                                    np.tile([0.0, 0, 1], (40, 1))]))
-    first = np.arange(40) == 0
-    np.testing.assert_array_equal(find_joined(cloud, first, np.ones(40, dtype=bool)), np.arange(40) < 20)
-    for some in (first, 0 * first > 0):
-        np.testing.assert_array_equal(find_joined(cloud, some, some), some)
-
-
-def test_groins_and_armpits_are_where_limbs_meet_the_trunk():
-    at = BODY.vertices[find_limb_roots(BODY, MODEL.skeleton, PART, KINDS)]
-    roots = MODEL.skeleton.joints[[p for p, kind in enumerate(KINDS) if kind in ("thigh", "upper_arm")]]
-    apart = np.linalg.norm(at[:, None] - roots, axis=2)
-    assert apart.min(axis=1).max() < 0.25 and (apart.min(axis=0) < 0.15).all()
-
-
-def test_skin_before_other_skin_is_told_apart():
-    """Two plates 5 cm apart see each other from their insides only; of each vertex 6 cm ahead is beyond the other."""
-    up, gap = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]], dtype=float), np.array([0, 0, 0.05])
-    facing = Mesh(np.concatenate([up, up + gap]), [[0, 1, 2], [3, 5, 4]])
-    away = Mesh(facing.vertices, [[0, 2, 1], [3, 4, 5]])
-    assert find_facing_skin(facing).all() and not find_facing_skin(away).any()
 
 
 def test_hair_on_a_head_is_no_doubt_and_clothes_are():

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 import trimesh
 from animal_bodies import Animal
-from humanoid_maker import NAMES, freedom, nearest_marks
+from humanoid_maker import NAMES
 from test_model_statue_cli import JOINTS
 
 from completion.__main__ import main
-from model.export.glb import encode_skinned_glb, write_skinned_glb
+from model.export.glb import write_skinned_glb
 from model.rig import joint_places
 from model.statue.control.chart import (
     Chart,
@@ -21,7 +21,6 @@ from model.statue.control.chart import (
     crossings,
     cut,
     densities,
-    find_seams,
     make_chart,
     orientation,
 )
@@ -32,7 +31,6 @@ from model.statue.motion.motions import people_motion
 from scanprep import write_mesh
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.storage import StorageError
-from scanprep.skeleton.tree import Skeleton
 from scanprep.synthetic.people import LANDMARKS, MARKERS, SyntheticPerson, find_pose
 from scanprep.synthetic.topology import load_topology
 
@@ -175,16 +173,6 @@ def test_landmarks_and_markers_are_where_people_have_them():
             assert away < 0.015, name                            # not where people have ears and toes
 
 
-def test_what_is_stored_is_what_its_maker_makes():
-    control = humanoid()
-    assert control.skeleton.names == NAMES
-    axes, limits = freedom(load_topology().anatomy)
-    np.testing.assert_allclose(np.concatenate(control.axes), np.concatenate(axes), atol=1e-12)
-    np.testing.assert_allclose(np.concatenate(control.limits), np.concatenate(limits), atol=1e-12)
-    assert nearest_marks(control.mesh, LANDMARKS) == control.landmarks
-    assert nearest_marks(control.mesh, MARKERS) == humanoid_markers()
-
-
 def test_the_chart_is_one_to_one_and_even():
     control = humanoid()
     assert chart_problem(control.mesh, control.chart) is None
@@ -250,17 +238,6 @@ def test_an_animal_gets_a_chart():
     chart = automatic_chart(animal.mesh, animal.skeleton)
     assert chart_problem(animal.mesh, chart) is None
     assert densities(animal.mesh, chart).min() > 1 / 3
-
-
-@pytest.mark.slow
-def test_seams_go_on_to_what_the_skeleton_does_not_know():
-    """All of the animal one part: its legs and head are found because they come out small."""
-    mesh = Animal().mesh
-    whole = Skeleton(np.zeros(len(mesh.faces)), [-1], mesh.vertices.mean(axis=0)[None])
-    first = densities(mesh, make_chart(mesh, find_seams(mesh, whole)))
-    assert first.min() < 1 / 3
-    density = densities(mesh, automatic_chart(mesh, whole))
-    assert density.min() > 1 / 3
 
 
 def test_files_give_back_what_was_saved(tmp_path):
@@ -372,19 +349,6 @@ def test_for_texture_coordinates_in_two_charts_one_is_made(glb):
     with pytest.warns(UserWarning, match=r"changed\.glb.*a chart is made.*2 charts"):
         again = read_control(with_uv(glb, Chart(uv[used], faces.reshape(-1, 3)), control.mesh))
     assert chart_problem(again.mesh, again.chart) is None
-
-
-def test_two_bodies_in_one_mesh_are_refused(tmp_path):
-    control = humanoid()
-    n = len(control.mesh.vertices)
-    rig = replace(control.rig, mesh=Mesh(np.vstack([control.mesh.vertices, control.mesh.vertices + [2, 0, 0]]),
-                                         np.vstack([control.mesh.faces, control.mesh.faces + n])),
-                  weights=np.vstack([control.weights] * 2), shapes=np.zeros((0, 2 * n, 3)),
-                  skeleton=Skeleton(np.tile(control.skeleton.part_of_face, 2), control.skeleton.parents,
-                                    control.skeleton.joints, NAMES))
-    (tmp_path / "two.glb").write_bytes(encode_skinned_glb(rig))
-    with pytest.raises(StorageError, match=r"two\.glb.*2 components, the largest is 50%"):
-        read_control(tmp_path / "two.glb")
 
 
 def with_eyes(path, pose=None):

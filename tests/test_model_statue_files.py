@@ -1,8 +1,6 @@
-"""Statues for other programs: GLB with images, X3D; read back by readers of their own."""
+"""Statues for other programs: GLB with images, read back by a reader of its own."""
 import io
 import json
-from dataclasses import replace
-from xml.etree import ElementTree
 
 import numpy as np
 import pytest
@@ -14,7 +12,7 @@ from model.statue.control.chart import Chart
 from model.statue.control.files import humanoid
 from model.statue.detail.subdivision import subdivide_uniform
 from model.statue.detail.texels import chart_tangents, normal_image, vertex_of_row
-from model.statue.files import ABOUT, KIND, load_statue, write_statue_glb, write_x3d
+from model.statue.files import ABOUT, KIND, load_statue, write_statue_glb
 from model.statue.motion.motions import people_motion
 from scanprep.geometry import rotations
 from scanprep.geometry.mesh import Mesh
@@ -80,16 +78,11 @@ def test_the_detailed_statue_moves_and_wears_its_texture(detailed, motion, tmp_p
 
 def test_the_control_mesh_with_images_of_detail(detailed, tmp_path):
     control, (fine, vertices) = humanoid(), detailed
-    rng = np.random.default_rng(0)
-    normals, heights = normal_image(control, vertices, fine, 256), rng.normal(0, 0.01, (32, 32)).astype(np.float32)
-    write_statue_glb(tmp_path / "a.glb", control, normals=normals, heights=heights, up=1)
+    normals = normal_image(control, vertices, fine, 256)
+    write_statue_glb(tmp_path / "a.glb", control, normals=normals, up=1)
     glb = Glb((tmp_path / "a.glb").read_bytes())
     material = glb.json["materials"][0]
     assert np.array_equal(picture(glb, material["normalTexture"]["index"]), normals)
-    extras = material["extras"]
-    grey = picture(glb, extras["displacementTexture"]["index"]).astype(float)
-    found = extras["displacementBlack"] + grey / 65535 * (extras["displacementWhite"] - extras["displacementBlack"])
-    assert np.abs(found - heights).max() < 1e-6 and extras["displacementUnit"] == "metre"
     # with nothing but the file, the normals of the detail come back
     uv, n, t = (glb.array(glb.primitive["attributes"][name]).astype(float)
                 for name in ("TEXCOORD_0", "NORMAL", "TANGENT"))
@@ -110,12 +103,6 @@ def test_the_control_mesh_with_images_of_detail(detailed, tmp_path):
     assert np.degrees(np.arccos(np.clip(np.median(flat), -1, 1))) > 5, "there is detail that the mesh has not"
 
 
-def test_a_surface_without_detail_has_an_even_normal_image():
-    control = humanoid()
-    image = normal_image(control, control.mesh.vertices, subdivide_uniform(control.mesh, control.chart, 0), 128)
-    assert np.abs(image.astype(int) - [128, 128, 255]).max() <= 1
-
-
 def test_tangents_go_along_the_rows_of_the_image():
     mesh = Mesh(np.array([[0, 0, 0], [2, 0, 0], [2, 1, 0], [0, 1, 0.0]]), np.array([[0, 1, 2], [0, 2, 3]]))
     turn = rotations.exp(np.array([0.3, -1, 2]))
@@ -128,15 +115,6 @@ def test_tangents_go_along_the_rows_of_the_image():
         assert upwards[:2] @ grows > 0.4, "the way in which v grows"
 
 
-def test_vertices_of_another_level_are_refused(detailed, tmp_path):
-    control, (fine, vertices) = humanoid(), detailed
-    with pytest.raises(ValueError, match="vertices, subdivision: expected both or none"):
-        write_statue_glb(tmp_path / "a.glb", control, vertices)
-    with pytest.raises(ValueError, match=rf"vertices: expected shape \({len(vertices)}, 3\), got \(5, 3\)"):
-        write_statue_glb(tmp_path / "a.glb", control, vertices[:5], fine)
-    assert not list(tmp_path.iterdir())
-
-
 @pytest.mark.parametrize("about, words", [
     ({"kind": "model", "version": 1}, "expected a statue in JSON, found something else"),
     ({"kind": KIND, "version": 99}, "statue version 99 is not known here"), ([1], "found something else")])
@@ -144,67 +122,3 @@ def test_folders_of_something_else_are_refused(tmp_path, about, words):
     (tmp_path / ABOUT).write_text(json.dumps(about))
     with pytest.raises(StorageError, match=words):
         load_statue(tmp_path)
-
-
-def numbers(node, name, width):
-    return np.array(node.get(name).replace(",", " ").split(), dtype=float).reshape(-1, width)
-
-
-def played(tree, pose, trans):
-    """The skin of the one humanoid in a pose, as H-Anim says: joints turn about their centres."""
-    person = tree.find("Scene/HAnimHumanoid")
-    points = numbers(person.find("Coordinate[@containerField='skinCoord']"), "point", 3)
-    out, listed = np.zeros_like(points), []
-
-    def below(node, above, root):
-        M, name, center = np.eye(4), node.get("DEF"), numbers(node, "center", 3)[0]
-        M[:3, :3] = rotations.exp(pose[NAMES.index(name)])
-        M[:3, 3] = center - M[:3, :3] @ center + (trans if root else 0)
-        M = above @ M
-        index = numbers(node, "skinCoordIndex", 1)[:, 0].astype(int)
-        moved = points[index] @ M[:3, :3].T + M[:3, 3]
-        np.add.at(out, index, numbers(node, "skinCoordWeight", 1) * moved)
-        listed.append(name)
-        for child in node.findall("HAnimJoint"):
-            below(child, M, False)
-
-    below(person.find("HAnimJoint[@containerField='skeleton']"), np.eye(4), True)
-    assert sorted(listed) == sorted(n.get("USE") for n in person.findall("HAnimJoint[@containerField='joints']"))
-    return out
-
-
-def test_the_joints_of_x3d_move_the_skin_as_the_statue(motion, tmp_path):
-    control = humanoid()
-    texture = np.random.default_rng(0).integers(0, 255, (16, 16, 3), dtype=np.uint8)
-    write_x3d(tmp_path / "a.x3d", control, texture=texture)
-    tree = ElementTree.parse(tmp_path / "a.x3d").getroot()
-    assert (tree.get("version"), tree.find("Scene/HAnimHumanoid").get("version")) == ("4.0", "2.0")
-    called = {node.get("DEF"): node.get("name") for node in tree.iter("HAnimJoint") if node.get("DEF")}
-    assert (called["l_wrist"], called["r_ankle"], called["vl5"]) == ("l_radiocarpal", "r_talocrural", "vl5")
-    U = turn_up(2).T
-    for t in range(4):
-        expected = control.rig.vertices(motion.poses[t], motion.trans[t]) @ U
-        assert np.abs(played(tree, motion.poses[t] @ U, motion.trans[t] @ U) - expected).max() < 2e-6
-    surface = next(tree.iter("IndexedFaceSet"))
-    assert np.array_equal(numbers(surface, "coordIndex", 4)[:, :3], control.mesh.faces)
-    uv = numbers(surface.find("TextureCoordinate"), "point", 2)[numbers(surface, "texCoordIndex", 4)[:, :3].astype(int)]
-    assert np.abs(uv - control.chart.uv[control.chart.faces]).max() < 1e-6
-    assert surface.find("Coordinate").get("USE") == tree.find("Scene/HAnimHumanoid/Coordinate").get("DEF")
-    (url,) = (node.get("url") for node in tree.iter("ImageTexture"))
-    assert np.array_equal(np.asarray(Image.open(tmp_path / url.strip('"'))), texture)
-    names = [node.get("DEF") for node in tree.iter() if node.get("DEF")]
-    assert len(names) == len(set(names)) and set(control.skeleton.names) < set(names)
-    write_x3d(tmp_path / "b.x3d", control, up=1)
-    still = ElementTree.parse(tmp_path / "b.x3d").getroot()
-    assert np.abs(played(still, np.zeros((17, 3)), np.zeros(3)) - control.mesh.vertices).max() < 2e-6
-    assert not list(still.iter("ImageTexture"))
-
-
-def test_x3d_takes_any_names(tmp_path):
-    control = humanoid()
-    odd = replace(control, skeleton=replace(control.skeleton, names=(
-        "Bip01 Pelvis", "Bip01:Pelvis", "2nd", "<&>", *control.skeleton.names[4:])))
-    write_x3d(tmp_path / "a.x3d", odd)
-    person = ElementTree.parse(tmp_path / "a.x3d").getroot().find("Scene/HAnimHumanoid")
-    names = [node.get("USE") for node in person.findall("HAnimJoint[@containerField='joints']")]
-    assert names[:4] == ["Bip01_Pelvis_0", "Bip01_Pelvis_1", "part_2nd", "part____"] and len(set(names)) == 17

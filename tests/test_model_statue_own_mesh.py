@@ -17,7 +17,7 @@ from model.export.names import names_of
 from model.statue.commands import read_scan
 from model.statue.control.files import humanoid, write_control
 from model.statue.control.model import MEASURED, DisplacementMap, Statue
-from model.statue.files import body_model, save_statue
+from model.statue.files import save_statue
 from model.statue.motion.motions import people_motion, write_body_motion
 from model.statue.own_mesh import animate_own_mesh, carry_weights, write_own_mesh
 from scanprep import Mesh, read_mesh, write_mesh
@@ -200,7 +200,6 @@ def test_a_skin_of_the_file_is_replaced_and_morph_targets_stay(file, written, st
 
 def test_a_statue_without_or_with_another_mesh_says_what_to_do(statue, written, tmp_path, capsys):
     save_statue(tmp_path / "statue", statue)
-    body_model(HUMAN).save(tmp_path / "statue" / "body.npz")
     write_body_motion(tmp_path / "squat.npz", HUMAN, squat())
     words = ["statue", "animate", str(tmp_path / "statue"), str(tmp_path / "squat.npz"), "-o", str(tmp_path / "out"),
              "--own-mesh", "--level", "0"]
@@ -209,8 +208,6 @@ def test_a_statue_without_or_with_another_mesh_says_what_to_do(statue, written, 
     (tmp_path / "statue" / "own.glb").write_bytes(written[0].read_bytes())
     assert main(words) == 1
     assert "of another fit" in capsys.readouterr().err
-    assert main([*words, "--model", str(tmp_path / "statue" / "body.npz")]) == 2
-    assert "--own-mesh" in capsys.readouterr().err
     write_mesh(tmp_path / "scan.ply", HUMAN.mesh)
     write_own_mesh(tmp_path / "statue" / "own.glb", tmp_path / "scan.ply", 1.0, statue)
     assert main([*words, "--names", "unreal"]) == 0

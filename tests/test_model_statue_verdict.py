@@ -6,8 +6,7 @@ import pytest
 
 from model.statue.control.files import humanoid
 from model.statue.control.model import FOLDED, HOLE, MEASURED, DisplacementMap
-from model.statue.detail.displacement import DisplacementConfig
-from model.statue.detail.reconstruction import measure_levels
+from model.statue.detail.reconstruction import Level, Reconstruction, reconstruction_error
 from model.statue.detail.subdivision import subdivide_uniform
 from model.statue.fit import FittedStatue, Posed, StatueConfig, fit_statue
 from model.statue.registration.features import FeatureFit
@@ -37,8 +36,10 @@ def statue_of(control, parts=(), kind=FOLDED, side=None):
 
 
 def judge(statue, scan=None):
-    scan = scan or subdivide_uniform(humanoid().mesh, humanoid().chart, 1).mesh(statue.control.mesh)
-    return judge_statue(statue, scan, measure_levels(statue, scan, 2)[0][-1])
+    fine = subdivide_uniform(humanoid().mesh, humanoid().chart, 1)
+    scan, surface = scan or fine.mesh(statue.control.mesh), Reconstruction(statue.control, statue.map, fine).mesh()
+    off = reconstruction_error(surface, scan).mean()
+    return judge_statue(statue, scan, Level("level 1", surface, off, off, np.ones(len(surface.faces), dtype=bool)))
 
 
 def with_joints(**moved):
@@ -125,5 +126,5 @@ def test_clicks_that_are_wrong_are_never_good(wrong):
         joints |= {"l_elbow": joints["l_shoulder"] - [0.1, 0, 0.28], "l_wrist": joints["l_shoulder"] - [0.1, 0, 0.5]}
     if wrong == "one leg twice":
         joints |= {f"r_{name}": joints[f"l_{name}"] - [0.02, 0, 0] for name in ("knee", "ankle")}
-    statue = fit_statue(person.mesh, joints, {}, config=StatueConfig(displacement=DisplacementConfig(size=256)))
+    statue = fit_statue(person.mesh, joints, {}, config=StatueConfig(size=256))
     assert (judge(statue, person.mesh).verdict == "good") == (wrong == "right")

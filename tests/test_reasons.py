@@ -43,10 +43,8 @@ SAID_BY = {
     "model/learning/scape.py judge_model": "learn",
     "model/coregistration/lead.py model_lead": "prep register, prep run",
     "model/statue/verdict.py judge_statue": "statue fit",
-    "model/statue/motion/motions.py read_statue_motion": "statue animate",
     "model/statue/own_mesh.py read_as_gltf": "statue fit",
     "model/statue/own_mesh.py read_pieces": "statue fit",
-    "model/statue/motion/motions.py follower_of": "statue animate",
     "scanprep/alignment/views.py views_problem": "prep views",
     "scanprep/plausible.py ": f"{ON_SCANS}, {ON_MARKERS}",
     "scanprep/plausible.py unit_problem":

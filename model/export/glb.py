@@ -19,11 +19,7 @@ from ..rig import Rig, check_motion
 
 @dataclass(frozen=True, eq=False)
 class Material:
-    """Texture, normal map and heights of a rig whose vertices are repeated at the seams of the texture chart.
-
-    glTF has no place for displacement maps. Heights become a grey image of 16 bits, which the material names in its
-    `extras`, with the heights of black and of white.
-    """
+    """Texture and normal map of a rig whose vertices are repeated at the seams of the texture chart."""
 
     uv: np.ndarray                           # (N, 2): (0, 0) is the lower left corner of the images, (1, 1) opposite
     normals: np.ndarray                      # (N, 3) unit, the same at all vertices of one place
@@ -32,7 +28,6 @@ class Material:
     tangents: np.ndarray | None = None
     color: np.ndarray | None = None          # (H, W, 3) uint8
     relief: np.ndarray | None = None         # (H, W, 3) uint8, normals in the frames of `tangents` and `normals`
-    heights: np.ndarray | None = None        # (H, W) metres
 
 
 def write_skinned_glb(path: str | Path, rig: Rig, poses: np.ndarray | None = None, trans: np.ndarray | None = None,
@@ -150,11 +145,6 @@ def _materials(glb: Glb, material: Material | None, colored: bool) -> dict[str, 
         out["pbrMetallicRoughness"]["baseColorTexture"] = texture(material.color, "color")
     if material is not None and material.relief is not None:
         out["normalTexture"] = texture(material.relief, "normal")
-    if material is not None and material.heights is not None:
-        low, high = float(material.heights.min()), float(material.heights.max())
-        grey = np.round(65535 * (material.heights - low) / max(high - low, 1e-12)).astype(np.uint16)
-        out["extras"] = {"displacementTexture": texture(grey, "displacement"), "displacementBlack": low,
-                         "displacementWhite": high, "displacementUnit": "metre"}
     if not images:
         return {"materials": [out]}
     # glTF codes: clamp to the edge, linear filter, smaller copies for distance

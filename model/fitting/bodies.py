@@ -142,14 +142,13 @@ class ShapedBody(FixedBody):
     Vertices are affine in betas with a matrix D that depends on the pose. Stitching D is expensive, so it is done at an
     anchor pose. From there bones carry D to nearby poses, rigidly with its part. The derivative by the pose is that of
     the subject that was built last. Only derivatives are approximate; at x itself the positions are those of the model.
-
-    `renew` is how far the betas may move, in standard deviations, before the subject is built anew; `turn`, radians,
-    how far a part may turn before D is stitched anew.
     """
 
-    def __init__(self, model: BodyModel, renew: float = 4.0, turn: float = 1.2) -> None:
-        self.model, self.renew, self.turn = model, renew, turn
-        self.n_betas = model.n_betas
+    RENEW = 4.0                      # standard deviations that betas may move before the subject is built anew
+    TURN = 1.2                       # radians that a part may turn before D is stitched anew
+
+    def __init__(self, model: BodyModel) -> None:
+        self.model, self.n_betas = model, model.n_betas
         self.template, self.skeleton = model.template, model.skeleton
         self.n_angles = 3 * len(model.skeleton.parents)
         self.pose_mean, self.pose_covariance = model.pose_mean, model.pose_covariance
@@ -191,10 +190,10 @@ class ShapedBody(FixedBody):
     def _carry(self, vertex_ids: np.ndarray, x: np.ndarray, weights: np.ndarray | None = None) -> CarriedPoints:
         pose, trans, betas = self.split(x)
         # derivatives by pose and by betas are renewed only when they have become too old
-        if np.linalg.norm(betas - self._at) > self.renew:
+        if np.linalg.norm(betas - self._at) > self.RENEW:
             self._at = betas.copy()
             self.subject = self.model.subject(betas)
-        if self._anchor is None or self._anchor.largest_angle(pose) > self.turn:
+        if self._anchor is None or self._anchor.largest_angle(pose) > self.TURN:
             self._anchor = anchor_at(self.model, pose)
         operator, at = self.subject.points(vertex_ids, weights), self._at
         # positions are exact at x: the gap corrects the linearised ones
@@ -382,8 +381,8 @@ def as_body(body: BodyModel | Subject) -> FixedBody:
     raise ValueError(f"body: expected a BodyModel or a Subject, got {type(body).__name__}")
 
 
-def at_rest(model: BodyModel, betas: np.ndarray | None = None) -> Mesh:
-    """Compute the body with betas (k,), else the mean person or character, in the pose of the template."""
+def at_rest(model: BodyModel) -> Mesh:
+    """Compute the mean person, or the character, in the pose of the template."""
     pose = np.zeros((len(model.skeleton.parents), 3))
     mean = np.zeros(model.n_betas) if model.n_betas else None
-    return model.template.with_vertices(model.vertices(pose, mean if betas is None else betas), model.template.up)
+    return model.template.with_vertices(model.vertices(pose, mean), model.template.up)

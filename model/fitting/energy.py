@@ -12,9 +12,7 @@ import numpy as np
 from scanprep.geometry import rotations
 from scanprep.geometry.least_squares import Residual
 
-from ..priors import GaussianPrior, JointLimits
-
-GIVE = 0.1                           # radians beyond a joint limit that cost as much as one standard deviation
+from ..priors import GaussianPrior
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,18 +97,6 @@ def upright_term(x: np.ndarray, of_body: np.ndarray, up: np.ndarray, sd: float) 
     J = np.zeros((*axis.shape, x.shape[-1]))
     J[..., :3] = -rotations.hat(axis) @ R @ rotations.right_jacobian(x[..., :3]) / sd
     return Residual((axis - up) / sd, J)
-
-
-def joint_limits(x: np.ndarray, limits: JointLimits, weight: float = 1.0) -> Residual:
-    """Compute residuals of joints beyond their limits, in units of `GIVE`; zero within.
-
-    [SCAPE-patent] §0090
-    """
-    count, root = limits.low.size, np.sqrt(weight) / GIVE
-    beyond, slope = limits.residual(x[..., :count].reshape(*x.shape[:-1], -1, 3))
-    J = np.zeros((*beyond.shape, x.shape[-1]))
-    J[..., :count] = root * slope
-    return Residual(root * beyond, J)
 
 
 def shape_prior(x: np.ndarray, first: int, weight: float = 1.0) -> Residual:

@@ -13,7 +13,7 @@ from .bodies import FixedBody
 from .free_space import INSIDE, PRESSED, Outside
 from .named_points import distinct_bodies
 from .scan import spread_points
-from .scan_fit import EVIDENCE, ScanFit
+from .scan_fit import CONTACT, EVIDENCE, ScanFit
 from .starts import approach, best_starts, from_nothing, sample_vertices
 from .upright import AXES, Upright, standing_axis
 
@@ -202,7 +202,7 @@ class LimbSearch:
         share = np.isin(fit.part[fit.sample.spread], fit.part[self.ids]).mean()
         # inside the rest of the body, in free space, off the scan points that it should explain; and the prior
         depth = self.rest.depth(places) * self.loose
-        cost = config.contact_weight * share * (np.minimum(depth, cap)**2).mean(axis=1)
+        cost = CONTACT * share * (np.minimum(depth, cap)**2).mean(axis=1)
         if self.free is not None:
             cost += config.free_space_weight * share * (np.minimum(self.free.at(places), cap)**2).mean(axis=1)
         if len(self.wanted):

@@ -196,9 +196,9 @@ def find_joined(cloud: ScanPoints, some: np.ndarray, others: np.ndarray) -> np.n
     return out
 
 
-def find_facing_skin(body: Mesh, reach: float = 0.06) -> np.ndarray:
-    """Find the vertices (N,) with other skin before them: from `reach` metres out the body is nearer than they are."""
-    return Surface(body).closest(body.vertices + reach * body.vertex_normals).distances < 0.8 * reach
+def find_facing_skin(body: Mesh) -> np.ndarray:
+    """Find the vertices (N,) with other skin before them: from 6 cm out the body is nearer than they are."""
+    return Surface(body).closest(body.vertices + 0.06 * body.vertex_normals).distances < 0.8 * 0.06
 
 
 def find_limb_roots(body: Mesh, skeleton: Skeleton, part: np.ndarray, kinds: np.ndarray) -> np.ndarray:

@@ -12,7 +12,7 @@ from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.surface import OrientedPoints
 from scanprep.skeleton.tree import Skeleton
 
-from ..priors import LEAST_POSES, GaussianPrior, JointLimits, gaussian_prior
+from ..priors import GaussianPrior, gaussian_prior
 from . import energy
 from .bodies import FixedBody, ResizedBody
 from .free_space import Clothing, Contact, Outside, Violation, find_cameras, free_space_violation
@@ -28,6 +28,7 @@ MIN_COSINE = 0.6                     # smallest cosine between the normals of a 
 # A whole scan counts as so many independent measurements. Errors of the model are alike at neighbouring points, so this
 # is far below the number of points.
 EVIDENCE = 400.0
+CONTACT = 0.5                        # how much a vertex inside another part counts, against one that lies on the scan
 STRANGE, ODD = np.radians(45), 0.05  # joints this far from every known pose are penalised; standard deviation, radians
 
 
@@ -116,7 +117,6 @@ class ScanFit:
     template_vertices: np.ndarray
     points: np.ndarray
     prior: GaussianPrior
-    limits: JointLimits | None
     upright: Upright | None
     scan_points: int
     config: ScanFitConfig
@@ -250,15 +250,10 @@ class ScanFit:
         return float(sum(term.energy[0] for term in self.prior_terms(x[None]).values()))
 
     def prior_terms(self, x: np.ndarray) -> Terms:
-        """Compute the prior terms of poses (B, P): the Gaussian, joint limits if enabled, and that people stand.
-
-        [SCAPE-patent] §0090
-        """
-        weight = self.config.prior_weight
-        limits = {} if self.limits is None else {"joint_limits": energy.joint_limits(x, self.limits, weight)}
+        """Compute the prior terms of poses (B, P): the Gaussian, and that people stand."""
         stands = {} if self.upright is None else {"upright": energy.upright_term(x, self.upright.of_body,
                                                                                  self.upright.nearest(x), TILT)}
-        return {"pose_prior": energy.pose_prior_term(x, self.prior, weight), **limits, **stands}
+        return {"pose_prior": energy.pose_prior_term(x, self.prior, self.config.prior_weight), **stands}
 
     def step(self, x: np.ndarray, scan: ScanPoints, reach: float, steps: int = 1) -> tuple[np.ndarray, Matched]:
         """Take a Gauss-Newton step for one matching; return the unknowns (P,) and the matching."""
@@ -341,8 +336,8 @@ class ScanFit:
         """List the violations of space, each with its weight and its vertices."""
         config, places, normals = self.config, skin.places, skin.normals
         mine = self.sample.matched
-        out = [(config.contact_weight, self.sample.spread, self.sample.contact.violation(places[self.sample.spread],
-                                                                                         normals[self.sample.spread]))]
+        spread = self.sample.spread
+        out = [(CONTACT, spread, self.sample.contact.violation(places[spread], normals[spread]))]
         if self.data.cameras:
             out.append((config.free_space_weight, mine, free_space_violation(self.data.cameras, places[mine])))
         if self.data.clothing is not None:
@@ -357,12 +352,10 @@ def scan_fit(body: FixedBody, cloud: ScanPoints, vertices: np.ndarray, points: n
     `vertices` (L,) int and `points` (L, 3), metres, are landmarks on the template and on the scan, none or more.
     """
     sample = sample_body(body, None, config.model_points, config.ignored_parts)
-    prior, known = gaussian_prior(body.pose_mean, body.pose_covariance), len(body.pose_examples) >= LEAST_POSES
-    # joints may rotate 0.2 rad farther than in the training poses
-    limits = JointLimits.from_poses(body.pose_examples, 1.0, 0.2) if config.joint_limits and known else None
+    prior = gaussian_prior(body.pose_mean, body.pose_covariance)
     upright = Upright.of(body.template, body.skeleton, config.up, cloud.person is not None)
-    return ScanFit(sample, ScanData(cloud, config), vertices, points, prior, limits, upright,
-                   config.scan_points, config, np.random.default_rng(config.seed))
+    return ScanFit(sample, ScanData(cloud, config), vertices, points, prior, upright, config.scan_points, config,
+                   np.random.default_rng(0))
 
 
 def resize_to_person(body: FixedBody) -> tuple[FixedBody, float]:

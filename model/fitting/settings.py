@@ -3,7 +3,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from scanprep.ranges import Count, Positive, Seed, Settings, Signed
+from scanprep.ranges import Count, Positive, Settings, Signed
 
 
 @dataclass(frozen=True)
@@ -21,8 +21,6 @@ class ScanFitConfig(Settings):
         How far the scan lies from the predicted mesh, as the model is not exact.
     prior_weight : float
         Factor on the pose prior once the scan is used.
-    joint_limits : bool
-        Joints that rotate farther than in the training poses are held back.
     correspondences : bool
         Landmarks are multiplied first, by correlated correspondence, for closer starts; on the poses this was
         tuned on it changed the starts and not where they ended.
@@ -34,13 +32,9 @@ class ScanFitConfig(Settings):
         Vertices of the model that are matched to the scan.
     random_starts : int
         Poses drawn at random around each start, and for each limb that may be wrong.
-    seed : int
-        Of the random numbers.
     free_space_weight : float
         How much a vertex counts that stands where a single camera saw nothing, against one that lies on the
         scan; 0 when the scan has parts cut away by hand.
-    contact_weight : float
-        The same for a vertex that stands inside another part of the body.
     up : (3,) floats, optional
         The direction that is up in the scan, where people in it mostly stand; without it all directions are tried,
         and for a depth picture its four sides.
@@ -52,14 +46,11 @@ class ScanFitConfig(Settings):
     landmark_sd: Positive = 0.01
     scan_sd: Positive = 0.008
     prior_weight: float = 1.0
-    joint_limits: bool = False
     correspondences: bool = False
     rounds: Count = 8
     scan_points: Count = 2500
     model_points: Count = 1200
     random_starts: int = 60
-    seed: Seed = 0
     free_space_weight: float = 0.5
-    contact_weight: float = 0.5
     up: tuple[Signed, Signed, Signed] | None = None
     ignored_parts: tuple[str, ...] = ()

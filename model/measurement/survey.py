@@ -55,8 +55,8 @@ class Survey:
 
 
 @lru_cache(maxsize=2)
-def survey(sex: Sex, path: Path = TABLE) -> Survey:
-    """Read the table of a sex from a file of `tests/people/ansur2.py`.
+def survey(sex: Sex) -> Survey:
+    """Read the table of a sex, which `tests/people/ansur2.py` made.
 
     Raises
     ------
@@ -65,7 +65,7 @@ def survey(sex: Sex, path: Path = TABLE) -> Survey:
     """
     if sex not in WORDS:
         raise ValueError(f"sex: expected 'female' or 'male', got {sex!r}")
-    table = json.loads(path.read_text(encoding="utf-8"))
+    table = json.loads(TABLE.read_text(encoding="utf-8"))
     own = table[sex]
     return Survey(own["people"], tuple(table["measures"]), np.array(own["mean"]), np.array(own["sd"]),
                   np.array(table["shares"]), np.array(own["quantiles"]), np.array(own["correlation"]))

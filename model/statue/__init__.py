@@ -3,7 +3,7 @@
 control       the control model: mesh, skeleton, chart; the generic humanoid
 registration  features, found or clicked, then the shape-constrained surface
 detail        displacement map, texture, subdivision, reconstruction
-motion        motions of other skeletons, and of learned models
+motion        motions of other skeletons
 fit.py        all of it in one function; files, report, commands: what the commands write
 
 [Statues]

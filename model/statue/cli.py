@@ -15,7 +15,7 @@ COMMANDS = {
     "fit": ("A scan -> control model, displacement map and texture.", "model.statue.commands:fit"),
     "reconstruct": ("The detailed surface of a statue at any level, of an edited map too.",
                     "model.statue.commands:reconstruct"),
-    "animate": ("A statue in motion: of markers, BVH, or a learned model.", "model.statue.commands:animate"),
+    "animate": ("A statue in motion: of markers, BVH, or key poses.", "model.statue.commands:animate"),
 }
 
 

@@ -25,7 +25,6 @@ from scanprep.geometry.landmarks import write_landmarks
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.sanitise import sanitise
 from scanprep.judgement import Judgement
-from scanprep.pictures.gltf import write_animated_glb
 from scanprep.pictures.sheets import save_png, write_gif
 from scanprep.pictures.textures import Texture, read_texture
 from scanprep.pipeline.scans import ScanTask, find_scans
@@ -34,17 +33,13 @@ from scanprep.registration.unit import resolve_unit
 from scanprep.surfaces.cloud import read_sound_surface
 
 from ..body import Progress, share_progress
-from ..cli import read_body
 from ..export.names import Names, names_of
-from ..files import load_model
-from ..motion.onto import read_motion
 from .cli import LevelArg, MotionArg, StatueArg
 from .control.files import humanoid, read_control
 from .control.model import ControlModel
-from .detail.displacement import DisplacementConfig, coverage_shares
+from .detail.displacement import coverage_shares
 from .detail.reconstruction import (
     Reconstruction,
-    adaptive_level,
     displace_surface,
     find_inverted,
     in_folds,
@@ -55,7 +50,7 @@ from .detail.subdivision import divide_long_edges, subdivide_adaptive, subdivide
 from .detail.texels import bake_texture, scan_look
 from .files import BODY, body_model, load_statue, save_statue, write_body, write_for_programs, write_statue_glb
 from .fit import FittedStatue, StatueConfig, UnplacedError, fit_statue
-from .motion.motions import follower_of, read_statue_motion, write_body_motion
+from .motion.motions import read_statue_motion, write_body_motion
 from .outer import cut_plinth, find_plinth, keep_outer
 from .own_mesh import OWN_MESH, animate_own_mesh, read_pieces, write_own_mesh
 from .registration.automatic import nearest_unit, person_unit
@@ -66,7 +61,7 @@ from .verdict import judge_statue
 FEATURES = "features.json"           # joints and points of the face of a statue, to be mended in scape pick --joints
 LEFT_BY_MAP = "error left by the map where it is one-to-one, mean"
 SPLIT = 60        # longest side of triangles in the height of a figure: 3 cm on a person, as floors are near soles
-FINE = StatueConfig(displacement=DisplacementConfig(size=2048))
+FINE = StatueConfig(size=2048)
 
 
 def fit(scan: ScanArg, output: Output, features: Path | None = None, control: Path | None = None,
@@ -205,7 +200,6 @@ def write_statue(folder: Path, name: str, scan: Mesh, statue: FittedStatue, rows
     report_progress = progress or (lambda done, total: None)
     levels, fine = measure_levels(statue, scan)
     report_progress(1, 3)
-    adaptive = adaptive_level(statue, scan)
     write_mesh(folder / "reconstruction.ply", levels[-1].mesh)
     write_body(folder, statue)
     write_for_programs(folder, statue, levels[-1].mesh.vertices, fine, statue.upright_axis)
@@ -221,26 +215,22 @@ def write_statue(folder: Path, name: str, scan: Mesh, statue: FittedStatue, rows
             Metric("inverted triangles of the control mesh", surface.inverted)]
     # 2. what the map holds, and how far the reconstructed surface is from the scan
     shares, lacking = coverage_shares(control, statue.map), parts_without_data(statue)
-    left = remaining_error(control, statue.map, scan)
+    errors = remaining_error(control, statue.map, scan)
+    left = float(errors.mean()) if len(errors) else np.nan
     inverted = find_inverted(control, control.mesh.vertices, fine, levels[-1].mesh.vertices)
     outside = ~in_folds(control, statue.map, fine)[inverted]
-    stored = sum((folder / file).stat().st_size for file in ("control.npz", "displacement.png", "coverage.png"))
     rows += [Metric("one-to-one", 100 * shares["measured"], "% of the surface"),
              Metric("folded", 100 * shares["folded"], "% of the surface"),
              Metric("holes", 100 * shares["hole"], "% of the surface"),
              *([Metric("parts without data", ", ".join(lacking))] if lacking else []),
-             Metric(LEFT_BY_MAP, MM * left.mean, "mm"),
-             *(Metric(f"{one.name} to the scan, {what}", MM * value, "mm") for one in [*levels, adaptive]
+             Metric(LEFT_BY_MAP, MM * left, "mm"),
+             *(Metric(f"{one.name} to the scan, {what}", MM * value, "mm") for one in levels
                for what, value in (("mean", one.mean), ("RMS", one.rms))),
-             Metric("triangles of the adaptive subdivision", len(adaptive.mesh.faces)),
              Metric(f"inverted triangles at {levels[-1].name}", len(inverted)),
-             Metric("of these outside folds and holes", int(outside.sum())),
-             Metric("control model and map on disk", stored / 1e6, "MB"),
-             Metric("scan on disk as binary PLY", (12 * len(scan.vertices) + 13 * len(scan.faces)) / 1e6, "MB")]
+             Metric("of these outside folds and holes", int(outside.sum()))]
     picture = statue_picture(scan, statue, levels[-1])
     save_png(folder / "picture.png", picture)
-    statue_page(name, scan, statue, levels, rows, adaptive, in_motion(statue),
-                picture).write(folder / "report.html")
+    statue_page(name, scan, statue, levels, rows, in_motion(statue), picture).write(folder / "report.html")
     report_progress(3, 3)
     return rows
 
@@ -311,14 +301,12 @@ def reconstruct(statue: StatueArg, output: Output, level: LevelArg = 3, toleranc
     return Outcome(output, rows, judgement=Judgement())
 
 
-def animate(statue: StatueArg, motion: MotionArg, output: Output, model: Path | None = None,
-            registered: Path | None = None, rate: Positive | None = None, level: LevelArg = 2, meshes: bool = False,
-            own_mesh: bool = False, names: Names | None = None) -> Outcome:
+def animate(statue: StatueArg, motion: MotionArg, output: Output, rate: Positive | None = None, level: LevelArg = 2,
+            meshes: bool = False, own_mesh: bool = False, names: Names | None = None) -> Outcome:
     """A statue in motion: its skeleton moves the control mesh, the detail stands on the moving normals.
 
     The motion is BVH, motion.npz of any of our commands, AMASS, or a table of key poses (keys.csv). Parts are matched
-    by their names, and rest poses may differ. With --model the control mesh follows a learned model instead of plain
-    skinning, with all that the model knows of how skin moves; the motion is then one of that model.
+    by their names, and rest poses may differ.
 
     Example: scape statue animate statue walk.bvh -o walking
 
@@ -327,51 +315,31 @@ def animate(statue: StatueArg, motion: MotionArg, output: Output, model: Path | 
         motion: .bvh, .npz with poses, trans and mocap_frame_rate, or .csv with time and PART_rx, PART_ry, PART_rz in
             degrees.
         output: Folder to write: statue.glb, motion.npz with its model body.npz, motion.gif, and meshes on demand.
-        model: Learned model (.npz) that the control mesh follows.
-        registered: The model's template on the scan, in its triangles; else it is brought there.
         rate: Frames a second, where the motion's file does not say or says it wrongly.
         level: Level of detail of the files.
         meshes: Write the exact mesh of every frame.
         own_mesh: Write own.glb too, the mesh of the scan's file in motion; the statue is one of fit --own-mesh.
         names: Whose names the bones have: mixamo, unity, unreal, vrm, h-anim or opensim.
     """
-    if model is not None and (own_mesh or names):
-        raise UsageError(f"--{'own-mesh' if own_mesh else 'names'}: a learned model moves no bones; leave out --model")
     loaded = load_statue(statue)
     control, up = loaded.control, loaded.upright_axis
     fine = subdivide_uniform(control.mesh, control.chart, level)
     detailed = Reconstruction(control, loaded.map, fine)
-    doubts: list[str] = []
-    if model is None:
-        if registered is not None:
-            raise UsageError("--registered: expected --model with it")
-        moved, doubts = read_statue_motion(loaded, motion, rate)
-        bodies, frame_rate = control.rig.vertices(moved.poses, moved.trans), moved.rate
-        output.mkdir(parents=True, exist_ok=True)
-        write_statue_glb(output / "statue.glb", control, detailed(control.mesh.vertices), fine, loaded.texture,
-                         motion=moved, up=up, names=names)
-        if own_mesh:
-            animate_own_mesh(output / OWN_MESH, statue / OWN_MESH, loaded, moved, names)
-        write_body_motion(output / "motion.npz", control, moved)
-        body_model(control).save(output / BODY)                  # the model of the motion, to look at it by itself
-        rows = [Metric("joints that follow the motion", len(moved.matched)),
-                *([Metric("joints without one in the motion", ", ".join(moved.lacking))] if moved.lacking else [])]
-    else:
-        learned = load_model(model)
-        moves = read_motion(motion, learned, rate=rate)
-        there = None if registered is None else read_body(registered, learned.template).vertices
-        with bar("registering the model") as progress:
-            follower = follower_of(loaded, learned, there, progress)
-        bodies, frame_rate = follower.vertices(moves.poses, moves.trans), moves.rate
-        step = max(1, len(bodies) // 120)
-        write_animated_glb(output / "statue.glb", fine.faces, np.stack([detailed(body) for body in bodies[::step]]),
-                           frame_rate / step, up=up)
-        rows = [Metric("follows", str(model))]
-        doubts = moves.doubts
+    moved, doubts = read_statue_motion(loaded, motion, rate)
+    bodies = control.rig.vertices(moved.poses, moved.trans)
+    output.mkdir(parents=True, exist_ok=True)
+    write_statue_glb(output / "statue.glb", control, detailed(control.mesh.vertices), fine, loaded.texture,
+                     motion=moved, up=up, names=names)
+    if own_mesh:
+        animate_own_mesh(output / OWN_MESH, statue / OWN_MESH, loaded, moved, names)
+    write_body_motion(output / "motion.npz", control, moved)
+    body_model(control).save(output / BODY)                  # the model of the motion, to look at it by itself
+    rows = [Metric("joints that follow the motion", len(moved.matched)),
+            *([Metric("joints without one in the motion", ", ".join(moved.lacking))] if moved.lacking else [])]
     shown = bodies[::max(1, len(bodies) // 24)]
     with bar("rendering") as progress:
         write_gif(output / "motion.gif", motion_pictures(loaded, detailed, shown, progress),
-                  frame_rate * len(shown) / len(bodies))
+                  moved.rate * len(shown) / len(bodies))
     if meshes:
         with bar("writing meshes") as progress:
             for t, body in enumerate(bodies):
@@ -384,6 +352,6 @@ def animate(statue: StatueArg, motion: MotionArg, output: Output, model: Path | 
     if share > 0.008:
         doubts = [f"{100 * share:.1f}% of the triangles are inverted in a frame: the pose is beyond what the skin can "
                   "follow", *doubts]
-    return Outcome(output, [Metric("frames", len(bodies)), Metric("rate", frame_rate, "1/s"), *rows,
+    return Outcome(output, [Metric("frames", len(bodies)), Metric("rate", moved.rate, "1/s"), *rows,
                             Metric("inverted triangles in a frame, most", max(inverted))],
-                   {"level": level, "model": model or BODY}, judgement=Judgement.of(check=doubts))
+                   {"level": level, "model": BODY}, judgement=Judgement.of(check=doubts))

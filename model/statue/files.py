@@ -1,16 +1,13 @@
-"""A statue on disk: control model, images over its chart, and files for other commands and programs (glTF, X3D)."""
+"""A statue on disk: control model, images over its chart, and files for other commands and programs."""
 from __future__ import annotations
 
-import re
 from pathlib import Path
-from xml.etree import ElementTree
 
 import numpy as np
 
 from scanprep.geometry import storage
 from scanprep.geometry.images import open_image
 from scanprep.geometry.mesh import Mesh
-from scanprep.pictures.sheets import save_png
 from scanprep.synthetic import people
 
 from ..blend_weights import strongest
@@ -18,9 +15,8 @@ from ..export.glb import Material, write_skinned_glb
 from ..export.names import Names, rename_bones
 from ..features import linear_features
 from ..motion.retarget import Retargeted
-from ..rig import Rig, turn_up
+from ..rig import Rig
 from ..skinning import SkinningModel
-from .control.chart import Chart
 from .control.files import humanoid, humanoid_markers, read_control, write_control
 from .control.model import ControlModel, Statue
 from .detail.maps import read_map, write_map
@@ -153,23 +149,21 @@ def body_model(control: ControlModel, poses: np.ndarray | None = None) -> Skinni
 
 
 def write_for_programs(folder: Path, statue: Statue, vertices: np.ndarray, fine: Subdivision, up: int) -> None:
-    """Write statue.glb and statue.x3d (H-Anim); the normals of the detailed `vertices` become an image."""
+    """Write statue.glb; the normals of the detailed `vertices` become an image."""
     normals = normal_image(statue.control, vertices, fine, len(statue.map.heights))
     write_statue_glb(folder / "statue.glb", statue.control, texture=statue.texture, normals=normals,
-                     heights=statue.map.heights, up=up)
-    write_x3d(folder / "statue.x3d", statue.control, texture=statue.texture, up=up)
+                     up=up)
 
 
 def write_statue_glb(path: str | Path, control: ControlModel, vertices: np.ndarray | None = None,
                      subdivision: Subdivision | None = None, texture: np.ndarray | None = None,
-                     normals: np.ndarray | None = None, heights: np.ndarray | None = None,
-                     motion: Retargeted | None = None, up: int = 2, names: Names | None = None) -> None:
+                     normals: np.ndarray | None = None, motion: Retargeted | None = None, up: int = 2,
+                     names: Names | None = None) -> None:
     """Write a statue for any glTF 2.0 viewer, animation program or game engine; the axis `up` points up.
 
     glTF knows linear blend skinning only: joints carry the detailed vertices themselves, while `Reconstruction` moves
     the control mesh and sets the detail upon it anew. The rest pose is that of the scan. Without `vertices` (n, 3) of a
-    subdivision it is the control mesh itself, which `normals` (`normal_image`) and `heights` detail; glTF has no place
-    for heights, so they are an image that the material's `extras` name.
+    subdivision it is the control mesh itself, which `normals` (`normal_image`) detail.
     """
     if (vertices is None) != (subdivision is None):
         raise ValueError("vertices, subdivision: expected both or none")
@@ -183,81 +177,8 @@ def write_statue_glb(path: str | Path, control: ControlModel, vertices: np.ndarr
     row = vertex_of_row(mesh, chart)                            # vertices are repeated along the seams of the chart
     split = Mesh(mesh.vertices[row], chart.faces)
     tangents = None if normals is None else chart_tangents(mesh, chart)
-    material = Material(chart.uv, mesh.vertex_normals[row], tangents, texture, normals, heights)
+    material = Material(chart.uv, mesh.vertex_normals[row], tangents, texture, normals)
     rig = Rig(split, control.skeleton, strongest(weights)[row], np.zeros((0, *split.vertices.shape)))
     rig = rig if names is None else rename_bones(rig, names)
     poses, trans, rate = (None, None, 1.0) if motion is None else (motion.poses, motion.trans, motion.rate)
     write_skinned_glb(path, rig, poses, trans, rate, up=up, material=material)
-
-
-def write_x3d(path: str | Path, control: ControlModel, texture: np.ndarray | None = None, up: int = 2) -> None:
-    """Write a statue as an `HAnimHumanoid` of X3D 4.0, and its texture as a PNG of the same name beside it.
-
-    Joints have the names of H-Anim 2.0 where the control model's parts have those of 1.0, as the generic humanoid's,
-    and their centres in the pose of the scan, where no joint is turned. Skin and joints share their coordinates.
-    """
-    path = Path(path)
-    U = turn_up(up).T
-    root = ElementTree.Element("X3D", profile="Full", version="4.0")
-    head = ElementTree.SubElement(root, "head")
-    ElementTree.SubElement(head, "meta", name="generator", content="scapekit")
-    scene = ElementTree.SubElement(root, "Scene")
-    names = _names(control)
-    person = ElementTree.SubElement(scene, "HAnimHumanoid", DEF="statue", name="statue", version="2.0")
-    _skeleton(person, control, names, U)
-    for name in names:
-        ElementTree.SubElement(person, "HAnimJoint", USE=name, containerField="joints")
-    image = None if texture is None else path.with_suffix(".png").name
-    _skin(person, control.mesh.with_vertices(control.mesh.vertices @ U), control.chart, image)
-    if texture is not None:
-        save_png(path.with_suffix(".png"), texture)
-    ElementTree.indent(root, " ")
-    with storage.writing(path) as beside:
-        doctype = ('<?xml version="1.0" encoding="UTF-8"?>\n<!DOCTYPE X3D PUBLIC "ISO//Web3D//DTD X3D 4.0//EN" '
-                   '"https://www.web3d.org/specifications/x3d-4.0.dtd">\n')
-        beside.write_text(doctype + ElementTree.tostring(root, encoding="unicode") + "\n", encoding="utf-8")
-
-
-def _names(control: ControlModel) -> list[str]:
-    """Make the names of the parts valid and unique as XML identifiers."""
-    plain = [re.sub(r"[^A-Za-z0-9_]", "_", name) for name in control.skeleton.names]
-    plain = [name if name[:1].isalpha() else f"part_{name}" for name in plain]
-    return [name if plain.count(name) == 1 and name != "statue" else f"{name}_{j}" for j, name in enumerate(plain)]
-
-
-def _skeleton(person: ElementTree.Element, control: ControlModel, names: list[str], U: np.ndarray) -> None:
-    nodes: list[ElementTree.Element] = []
-    weights = strongest(control.weights)
-    renamed = {"wrist": "radiocarpal", "ankle": "talocrural"}       # joints that H-Anim 2.0 calls otherwise than 1.0
-    for j, parent in enumerate(control.skeleton.parents):
-        carried = np.flatnonzero(weights[:, j])
-        nodes.append(ElementTree.SubElement(
-            nodes[parent] if j else person, "HAnimJoint", DEF=names[j],
-            name=re.sub("^([lr]_)(wrist|ankle)$", lambda found: found[1] + renamed[found[2]], names[j]),
-            containerField="children" if j else "skeleton", center=_row(control.skeleton.joints[j] @ U),
-            skinCoordIndex=" ".join(map(str, carried)), skinCoordWeight=_row(weights[carried, j])))
-
-
-def _skin(person: ElementTree.Element, mesh: Mesh, chart: Chart, image: str | None) -> None:
-    def rows(values: np.ndarray) -> str:
-        return ", ".join(map(_row, values))
-
-    def corners(faces: np.ndarray) -> str:
-        return " ".join(f"{a} {b} {c} -1" for a, b, c in faces)
-
-    child = ElementTree.SubElement
-    child(person, "Coordinate", DEF="skin_points", containerField="skinCoord", point=rows(mesh.vertices))
-    child(person, "Normal", DEF="skin_normals", containerField="skinNormal", vector=rows(mesh.vertex_normals))
-    shape = child(person, "Shape", containerField="skin")
-    look = child(shape, "Appearance")
-    child(look, "Material", diffuseColor="0.8 0.77 0.74" if image is None else "1 1 1")
-    if image is not None:
-        child(look, "ImageTexture", url=f'"{image}"', repeatS="false", repeatT="false")
-    surface = child(shape, "IndexedFaceSet", coordIndex=corners(mesh.faces), texCoordIndex=corners(chart.faces))
-    child(surface, "Coordinate", USE="skin_points")
-    child(surface, "Normal", USE="skin_normals")
-    child(surface, "TextureCoordinate", point=rows(chart.uv))
-
-
-def _row(values: np.ndarray) -> str:
-    return " ".join(f"{value:.7g}" for value in np.round(values, 8) + 0.0)

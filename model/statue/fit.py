@@ -2,8 +2,8 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
-from typing import Literal
+from dataclasses import dataclass, replace
+from typing import Annotated, Literal
 
 import numpy as np
 from scipy.sparse import csr_array, diags_array
@@ -12,15 +12,15 @@ from scanprep.batch.room import Step, run_uncached
 from scanprep.geometry.landmark_names import FACE
 from scanprep.geometry.mesh import Mesh, take_any_mesh
 from scanprep.geometry.sanitise import sanitise
-from scanprep.ranges import Settings
+from scanprep.ranges import FLAG, Range, Settings
 
 from ..body import Progress, share_progress
 from .control.files import humanoid
 from .control.model import ControlModel, Statue
-from .detail.displacement import DisplacementConfig, bake_displacement, unfold_control
+from .detail.displacement import SIZE, bake_displacement, unfold_control
 from .registration.automatic import Features, find_features
 from .registration.features import FeatureFit, fit_features, head_share, warp
-from .registration.surface_fit import SurfaceFit, SurfaceFitConfig, fit_surface
+from .registration.surface_fit import SurfaceFit, fit_surface
 
 
 @dataclass(frozen=True)
@@ -29,25 +29,23 @@ class StatueConfig(Settings):
 
     Attributes
     ----------
-    surface : SurfaceFitConfig
-        Settings of the fit of the control mesh.
-    displacement : DisplacementConfig
-        Settings of the displacement map.
-    start : {"registered", "posed"}
-        Start of the surface fit where no features are given. "registered" is the control mesh registered to the scan.
-        "posed", as in the paper, is the control model posed by the features that were found, with its head warped.
+    size : int
+        Pixels of the displacement map, each way.
+    method : {"registered", "published"}
+        "registered" starts the surface at the control mesh registered to the scan, if no features are given, and
+        minimises its energy. "published" poses the control model by features, warps its head, and takes the paper's
+        steps.
 
     Examples
     --------
-    >>> StatueConfig.from_paper().start
-    'posed'
+    >>> StatueConfig.from_paper().method
+    'published'
 
     [Statues]
     """
 
-    surface: SurfaceFitConfig = field(default_factory=SurfaceFitConfig)
-    displacement: DisplacementConfig = field(default_factory=DisplacementConfig)
-    start: Literal["registered", "posed"] = "registered"
+    size: Annotated[int, Range(16, 8192), FLAG] = SIZE
+    method: Literal["registered", "published"] = "registered"
 
     @classmethod
     def from_paper(cls) -> StatueConfig:
@@ -60,7 +58,7 @@ class StatueConfig(Settings):
         filled smoothly where there is no solution. Adaptive triangles are small where the displaced surface is curved,
         not where the displacement is large.
         """
-        return cls(surface=SurfaceFitConfig.from_paper(), start="posed")
+        return cls(method="published")
 
 
 class UnplacedError(ValueError):
@@ -138,21 +136,20 @@ def fit_statue(scan: Mesh, joints: Mapping[str, np.ndarray] | None = None,
     [Statues]
     """
     control, config, scan = control or humanoid(), config or StatueConfig(), sanitise(scan)
-    inputs = (scan, joints, points, control)
+    inputs, published = (scan, joints, points, control), config.method == "published"
     # 1. pose the control model by features, which are found if none are given
     if joints is None and points is None:
         features = step("features", inputs, lambda: find_features(control, scan, share_progress(progress, 0, 40)))
-        posed = pose_automatically(control, features, config.start == "registered")                # [Statues] Eq. 4-5
+        posed = pose_automatically(control, features, not published)                               # [Statues] Eq. 4-5
     else:
         posed = pose_by_features(control, joints or {}, points or {})                           # [Statues] Eq. 1-5
     # 2. fit the control mesh to the scan, open its folds, and measure what is left as a displacement map
-    surface = step("surface", (inputs, config), lambda: fit_surface(
-        control.mesh, posed.start, scan, config.surface, share_progress(progress, 40, 80),
-        posed.hidden))                                                                           # [Statues] Eq. 6-18
+    surface = step("surface", (inputs, config), lambda: fit_surface(                             # [Statues] Eq. 6-18
+        control.mesh, posed.start, scan, published, share_progress(progress, 40, 80), posed.hidden))
     fitted = step("control", (inputs, config), lambda: fit_control(
-        control, posed.features, surface, scan, config.displacement))
-    map = step("map", (inputs, config), lambda: bake_displacement(
-        fitted, scan, config.displacement, share_progress(progress, 80, 100)))  # [Statues] Eq. 19-21
+        control, posed.features, surface, scan, config.size))
+    map = step("map", (inputs, config), lambda: bake_displacement(                              # [Statues] Eq. 19-21
+        fitted, scan, config.size, share_progress(progress, 80, 100)))
     return FittedStatue(fitted, posed.features.pose, map, posed=posed, surface=surface)
 
 
@@ -194,10 +191,9 @@ def pose_automatically(control: ControlModel, found: Features, registered: bool 
                    face=posed.face if "skullbase" in found.missing else 0)
 
 
-def fit_control(control: ControlModel, posed: FeatureFit, surface: SurfaceFit, scan: Mesh,
-                config: DisplacementConfig | None = None) -> ControlModel:
+def fit_control(control: ControlModel, posed: FeatureFit, surface: SurfaceFit, scan: Mesh, size: int) -> ControlModel:
     """Build the control model on the scan, with folds opened and its joints where the features put them."""
-    unfolded = spread_flat(unfold_control(control.refit(surface.vertices, posed.joints), scan, config).mesh).vertices
+    unfolded = spread_flat(unfold_control(control.refit(surface.vertices, posed.joints), scan, size).mesh).vertices
     root = unfolded[control.skeleton.part_of_vertex(control.mesh) == 0].mean(axis=0)
     return control.refit(unfolded, np.vstack([root, posed.joints[1:]]))
 

@@ -14,40 +14,40 @@ from scanprep.judgement import size
 from scanprep.pictures.camera import Camera
 from scanprep.pictures.page import Page
 from scanprep.pictures.scene import Pane, picture_panes
-from scanprep.pictures.shading import CLAY, Bones, Dots, Heat, Solid, contact_sheet, part_colors, render
+from scanprep.pictures.shading import CLAY, Bones, Dots, Heat, Solid, part_colors, render
 from scanprep.pictures.sheets import webp_bytes
 from scanprep.pictures.thinning import MOST, thin_solid
 from scanprep.synthetic.people import find_pose, synthesise_walk
 
 from .control.files import humanoid
-from .control.model import FOLDED, HOLE, MEASURED, OUTSIDE, Statue
+from .control.model import FOLDED, HOLE, MEASURED, Statue
 from .detail.reconstruction import Level, Reconstruction, coverage_at
 from .detail.subdivision import subdivide_uniform
 from .motion.motions import people_motion
 
 HEIGHT = 520                         # pixels of the pictures
 MOVED = MOST // 2                    # triangles of a body that is shown beside others
-KINDS = {MEASURED: (0.62, 0.70, 0.78), FOLDED: (0.86, 0.36, 0.22), HOLE: (0.93, 0.75, 0.42), OUTSIDE: (1.0, 1.0, 1.0)}
+KINDS = {MEASURED: (0.62, 0.70, 0.78), FOLDED: (0.86, 0.36, 0.22), HOLE: (0.93, 0.75, 0.42)}
 
 
-def cameras(statue: Statue, subject: Any, turns: Sequence[float] = (0, 90, 180, 270)) -> list[Camera]:
-    """Place cameras around a subject (Mesh or points), from the front on, where the control model looks."""
+def place_camera(statue: Statue, subject: Any, turn: float) -> Camera:
+    """Place a camera around a subject (Mesh or points), turned by degrees from where the control model looks."""
     front, axis = -statue.control.skeleton.part_rotations(statue.pose)[0][:, 1], statue.upright_axis
     first, second = np.eye(3)[[(axis + 1) % 3, (axis + 2) % 3]]
     azimuth = float(np.degrees(np.arctan2(front @ second, front @ first)))
-    return [Camera.around(subject, azimuth + turn, up=axis) for turn in turns]
+    return Camera.around(subject, azimuth + turn, up=axis)
 
 
 def statue_picture(scan: Mesh, statue: Statue, level: Level) -> np.ndarray:
     """Picture scan, control mesh and reconstruction from the front, and scan and reconstruction from behind."""
-    back, = cameras(statue, scan, (200,))
+    back = place_camera(statue, scan, 200)
     bare, control, made = first_panes(scan, statue, level)
     return picture_panes([bare, control, made, replace(bare, camera=back), replace(made, camera=back)], HEIGHT)
 
 
 def first_panes(scan: Mesh, statue: Statue, level: Level) -> list[Pane]:
     """Draw the scan, the control mesh in the colours of its parts, and the reconstruction."""
-    camera, = cameras(statue, scan, (20,))
+    camera = place_camera(statue, scan, 20)
     coverage = np.array([KINDS[kind] for kind in coverage_of_vertices(statue)])
     control = Solid(statue.control.mesh, part_colors(statue.control.skeleton.part_of_face), smooth=False,
                     shades={"measured, folded, hole": coverage})
@@ -56,7 +56,7 @@ def first_panes(scan: Mesh, statue: Statue, level: Level) -> list[Pane]:
 
 
 def statue_page(name: str, scan: Mesh, statue: Statue, levels: Sequence[Level], metrics: Sequence[Metric],
-                adaptive: Level, frames: Sequence[tuple[str, Mesh]], picture: np.ndarray) -> Page:
+                frames: Sequence[tuple[str, Mesh]], picture: np.ndarray) -> Page:
     """Make the page of `scape statue fit`: levels, coarsest first, the figures, the statue in other poses."""
     page = Page(f"{name}, a statue that moves", "A control mesh with a skeleton was fitted to the scan; the detail of "
                 "the scan is an image over it.")
@@ -73,37 +73,20 @@ def statue_page(name: str, scan: Mesh, statue: Statue, levels: Sequence[Level], 
         Bones(joints[control.skeleton.parents[1:]], joints[1:], on_top=True, name="skeleton"),
         Dots(joints, radius=0.0085 * size(control.mesh), on_top=True, name="joints", labels=control.skeleton.names),
         Dots(control.mesh.vertices[marks], (0.15, 0.45, 0.75), 0.006, True, name="feature points", labels=names)],
-                      cameras(statue, scan, (20,))[0])], height=HEIGHT)
-    page.section("Displacement map", "White: the scan lies outside the control mesh, black: inside. Right: blue was "
-                 "measured; red is folded, not one-to-one with the control mesh; yellow is a hole of the scan. Red and "
-                 "yellow were filled smoothly.")
-    # heights as grey values (white out, black in, the middle grey zero), and the coverage in colours
-    step = max(1, len(statue.map.heights) // 640)
-    heights, coverage = statue.map.heights[::step, ::step], statue.map.coverage[::step, ::step]
-    covered = coverage != OUTSIDE
-    most = float(np.quantile(np.abs(heights[covered]), 0.995)) if covered.any() else 1.0
-    grey = np.where(covered, 127.5 + 127.5 * np.clip(heights / max(most, 1e-9), -1, 1), 255).astype(np.uint8)
-    colors = np.zeros((256, 3))
-    colors[list(KINDS)] = list(KINDS.values())
-    page.picture(webp_bytes(contact_sheet(
-        (np.repeat(grey[..., None], 3, axis=-1), (255 * colors[coverage]).astype(np.uint8)),
-        ("displacement", "coverage"))))
-    page.section("Levels of detail, and their distance to the scan", "The same map on ever fewer triangles, and on "
-                 "triangles that are small only where the displacement asks for it. Grey: holes of the scan, which "
-                 "do not count.")
+                      place_camera(statue, scan, 20))], height=HEIGHT)
+    page.section("Levels of detail, and their distance to the scan", "The same map on ever fewer triangles. Grey: "
+                 "holes of the scan, which do not count.")
     page.table([(one.name, len(one.mesh.vertices), f"{1000 * one.mean:.2f}", f"{1000 * one.rms:.2f}")
                 for one in levels], ("level", "vertices", "mean, mm", "RMS, mm"))
-    surface, camera, panes = Surface(scan), cameras(statue, scan, (20,))[0], []
-    for one in [*reversed(levels), adaptive]:
-        far = surface.closest(one.mesh.vertices).distances
-        far[one.mesh.faces[~one.shown]] = np.nan
-        # to 3 mm, the end of the colours
-        solid = Solid(one.mesh, Heat(far, 0.0, 0.003, "distance to the scan"), shades={"plain": np.array(CLAY)})
-        panes.append(Pane([thin_solid(solid, MOVED)], camera, f"{one.name}: {len(one.mesh.faces):,} triangles"))
-    page.bodies(panes, thinned, 420)
+    finest = levels[-1]
+    far = Surface(scan).closest(finest.mesh.vertices).distances
+    far[finest.mesh.faces[~finest.shown]] = np.nan
+    # to 3 mm, the end of the colours
+    solid = Solid(finest.mesh, Heat(far, 0.0, 0.003, "distance to the scan"), shades={"plain": np.array(CLAY)})
+    page.bodies([Pane([thin_solid(solid, MOVED)], place_camera(statue, scan, 20), finest.name)], thinned, HEIGHT)
     if frames:
         page.section("In motion", "The skeleton moves the control mesh, and the detail stands on its moving normals.")
-        page.bodies([Pane([thin_solid(Solid(mesh), MOVED)], cameras(statue, mesh, (20,))[0], label)
+        page.bodies([Pane([thin_solid(Solid(mesh), MOVED)], place_camera(statue, mesh, 20), label)
                      for label, mesh in frames], thinned, HEIGHT)
     return page
 
@@ -138,7 +121,7 @@ def in_motion(statue: Statue) -> list[tuple[str, Mesh]]:
 def motion_pictures(statue: Statue, detailed: Reconstruction, bodies: np.ndarray,
                     progress: Callable[[int, int], None] | None = None) -> list[np.ndarray]:
     """Picture frames of control vertices (T, N, 3), all from one camera in front."""
-    camera, out = cameras(statue, bodies.reshape(-1, 3), (25,))[0], []
+    camera, out = place_camera(statue, bodies.reshape(-1, 3), 25), []
     for t, body in enumerate(bodies):
         out.append(render(detailed.mesh(body), camera, int(360 * camera.width / camera.height) + 10, 360))
         if progress:

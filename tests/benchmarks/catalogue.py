@@ -349,7 +349,7 @@ BENCHMARKS = (
               "mittens of the control mesh.",
               quick="statues.py DATA/scape_poses/mesh029.ply DATA/spring_shapes/SPRING0028.ply --emboss"),
     Benchmark("statue_fit", "Statues: fit of the control mesh", "statue_fit.py", statues.surface_fits,
-              "Fig. 6 and 7 of the paper, then bodies from the same start. `published` are its Euler steps, and its "
-              "own slack where said; `register` the whole registration of scans, `settle` its last pass. Where we "
+              "Fig. 6 and 7 of the paper, then bodies from the same start. `published` are its Euler steps and its "
+              "own slack; `register` the whole registration of scans, `settle` its last pass. Where we "
               "lose: time, to that pass alone."),
 )

@@ -129,7 +129,7 @@ def soft_tissue(report: dict) -> Lines:
 
 
 def statues(report: dict) -> Lines:
-    finest = [row["levels"][-1]["mean_mm"] for row in report["rows"] if not row["vectors"]]
+    finest = [row["levels"][-1]["mean_mm"] for row in report["rows"]]
     return [(f"{len(finest)} scans as statues, 400,000 triangles: distance to the scan, {which}", f"{value:.2f} mm")
             for which, value in (("best", min(finest)), ("worst", max(finest)))]
 

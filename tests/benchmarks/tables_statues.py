@@ -8,7 +8,7 @@ def statues(report: dict) -> str:
     """A row for every scan, with the paper's below."""
     rows: Rows = []
     for one in report["rows"]:
-        rows.append((one["scan"] + (", vectors" if one["vectors"] else ""), one["triangles"],
+        rows.append((one["scan"], one["triangles"],
                      *(f"{level['mean_mm']:.2f} / {level['rms_mm']:.2f}" for level in one["levels"]),
                      one["e_mm"], f"{one['folded']:.2%}", f"{one['hole']:.1%}", one["inverted_outside_folds"],
                      round(one["frames_per_s"]), one["cpu_s"]))

@@ -160,11 +160,11 @@ def make_chart(mesh: Mesh, seams: Sequence[np.ndarray]) -> Chart:
     return chart
 
 
-def automatic_chart(mesh: Mesh, skeleton: Skeleton, rounds: int = 4) -> Chart:
-    """Make a chart and extend its seams to crowded regions, such as fingertips; at most `rounds` charts are made."""
+def automatic_chart(mesh: Mesh, skeleton: Skeleton) -> Chart:
+    """Make a chart and extend its seams to crowded regions, such as fingertips; at most four charts are made."""
     seams, graph = find_seams(mesh, skeleton), _costs(mesh)
     chart = make_chart(mesh, seams)
-    for _ in range(rounds - 1):
+    for _ in range(3):
         # another seam to the smallest triangle of every region that is scaled below a third of the mean, in length
         density, longer = densities(mesh, chart), list(seams)
         crowded = np.flatnonzero(density < 1 / 3)

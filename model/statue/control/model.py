@@ -109,14 +109,10 @@ class DisplacementMap:
     coverage : (H, W) uint8
         MEASURED; FOLDED where the surface is not one-to-one with the control mesh; HOLE where there are no data;
         OUTSIDE the chart.
-    vectors : (H, W, 3) float32, metres, optional
-        To be added to the heights along the normals, in the axes of the world as the scan stands: zero where the
-        surface is one-to-one with the control mesh, and in folds what no height can say.
     """
 
     heights: np.ndarray
     coverage: np.ndarray
-    vectors: np.ndarray | None = None
 
 
 @dataclass(frozen=True, eq=False)

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Annotated
 
 import numpy as np
 from scipy.sparse import csc_array, csr_array, diags_array
@@ -17,7 +16,6 @@ from scipy.spatial import cKDTree
 from scanprep.geometry import sparse
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.surface import OrientedPoints, Rays, Surface
-from scanprep.ranges import FLAG, Positive, Range, Settings
 from scanprep.threads import search_threads
 
 from ...body import Progress
@@ -25,60 +23,32 @@ from ..control.model import FOLDED, HOLE, MEASURED, OUTSIDE, ControlModel, Displ
 from .normal_volume import Crossings, find_crossings, interpolate, limits, not_inverted, outer_layers
 from .texels import Lattice, Texels, find_texels
 
+UNFOLDINGS = 2                       # rounds of opening folds, each of which takes as long as a small map
 SPACING = 0.002                      # metres between the scan points that attract the surface over folds
 # Metres that an island of less than 1 cm² in a hole may be off the surface around it: right ones in ragged holes are
 # 1.4 off by the median, 4 in nine of ten; wrong ones 10 to 96 (in mm).
 ISLAND = 0.005
+SIZE = 1024                          # pixels of the image, each way: 2 mm on a person
+REACH = 0.1                          # metres: largest height, up or down; what is farther off is another part
 
 
-@dataclass(frozen=True)
-class DisplacementConfig(Settings):
-    """Settings of `bake_displacement`.
-
-    Attributes
-    ----------
-    size : int
-        Pixels of the image, each way.
-    reach : float, metres
-        Largest height, up or down.
-    vectors : bool
-        Displacements of any direction where the surface is not one-to-one.
-    """
-
-    size: Annotated[int, Range(16, 8192), FLAG] = 1024
-    reach: Positive = 0.1
-    vectors: bool = False
-
-
-def bake_displacement(control: ControlModel, scan: Mesh, config: DisplacementConfig | None = None,
-                      progress: Progress | None = None) -> DisplacementMap:
-    """Compute the displacement map of a scan over a control model that has been fitted to it.
+def bake_displacement(control: ControlModel, scan: Mesh, size: int = SIZE, progress: Progress | None = None
+                      ) -> DisplacementMap:
+    """Compute the displacement map, `size` pixels each way, of a scan over a control model that was fitted to it.
 
     ValueError for a scan without triangles, or a chart that covers no pixel.
 
     [Statues] Eq. 19, 20, 21
     """
-    config, report_progress = config or DisplacementConfig(), progress or (lambda done, total: None)
-    ready = ReadyScan(scan)
-    result = find_heights(control, ready, config)
+    report_progress = progress or (lambda done, total: None)
+    result = find_heights(control, ReadyScan(scan), size)
     report_progress(1, 2)
-    texels, heights = result.texels, result.heights
+    texels = result.texels
     coverage = np.where(result.folded, FOLDED, np.where(result.known, MEASURED, HOLE)).astype(np.uint8)
     coverage[~texels.inside] = OUTSIDE
-    vectors = None
-    if config.vectors:                           # what is to be added to the heights in and around folds
-        lattice = Lattice(control, 4)
-        drawn, u = bend_over_folds(lattice, ready, result, config.reach)
-        near = np.unique(lattice.subdivision.face_parent[drawn[lattice.fine.faces].any(axis=1)])
-        which = np.flatnonzero(np.isin(texels.faces, near))
-        which = which[lattice.sample(drawn.astype(float), texels.faces[which], texels.bary[which]) > 0]
-        faces, bary = texels.faces[which], texels.bary[which]
-        more = np.zeros((len(heights), 3))
-        more[which] = (lattice.sample(u, faces, bary)
-                       - result.heights[which, None] * interpolate(control.mesh, faces, bary)[1])
-        vectors = texels.image(more.astype(np.float32))
+    heights = texels.image(result.heights.astype(np.float32))
     report_progress(2, 2)
-    return DisplacementMap(texels.image(heights.astype(np.float32)), texels.image(coverage, OUTSIDE), vectors)
+    return DisplacementMap(heights, texels.image(coverage, OUTSIDE))
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,19 +76,19 @@ class Heights:
     folded: np.ndarray
 
 
-def find_heights(control: ControlModel, scan: ReadyScan, config: DisplacementConfig) -> Heights:
+def find_heights(control: ControlModel, scan: ReadyScan, size: int) -> Heights:
     """Measure, classify and fill the heights; arguments and errors as of `bake_displacement`."""
     import igl
 
     if not len(scan.mesh.faces):
         raise ValueError(f"scan: expected at least one triangle, got {scan.mesh}")
-    mesh, reach, texels = control.mesh, config.reach, find_texels(control.mesh, control.chart, config.size)
+    mesh, texels = control.mesh, find_texels(control.mesh, control.chart, size)
     if not texels.inside.any():
-        raise ValueError(f"size: {config.size} pixels are too few, no pixel's centre lies in the chart")
+        raise ValueError(f"size: {size} pixels are too few, no pixel's centre lies in the chart")
     # 1. crossings of each pixel's normal with the scan, without other body parts and inverted triangles
     points, normals = interpolate(mesh, texels.faces, texels.bary)
-    met = outer_layers(find_crossings(scan.mesh, scan.rays, points, normals, reach))
-    low, high = limits(mesh, points, normals, reach)
+    met = outer_layers(find_crossings(scan.mesh, scan.rays, points, normals, REACH))
+    low, high = limits(mesh, points, normals, REACH)
     owner = met.normal
     far = met.heights * np.linalg.norm(normals[owner], axis=1)
     met = met.pick((met.cosines > 0.1) & (far >= low[owner]) & (far <= high[owner])
@@ -133,7 +103,7 @@ def find_heights(control: ControlModel, scan: ReadyScan, config: DisplacementCon
         nearest = scan.surface.closest(points[empty])
         ends = np.isin(scan.mesh.faces[nearest.faces], scan.mesh.boundary_vertices).any(axis=1)
         inside = np.asarray(igl.fast_winding_number(scan.mesh.vertices, scan.mesh.faces, points[empty])).ravel() > 0.5
-        folded[empty] = ~((nearest.distances > reach) | ends | (~inside & (nearest.distances > 0.01)))
+        folded[empty] = ~((nearest.distances > REACH) | ends | (~inside & (nearest.distances > 0.01)))
     # 3. fill from around: harmonic on the control surface, so across seams too. Islands in holes that stand off what is
     # around the hole are crossings with another side of the scan, and would be thorns.
     lattice, filled = Lattice(control), heights.copy()
@@ -147,25 +117,22 @@ def find_heights(control: ControlModel, scan: ReadyScan, config: DisplacementCon
     return Heights(texels, filled, known, folded)
 
 
-def unfold_control(control: ControlModel, scan: Mesh, config: DisplacementConfig | None = None, rounds: int = 2
-                   ) -> ControlModel:
+def unfold_control(control: ControlModel, scan: Mesh, size: int = SIZE) -> ControlModel:
     """Open the folds of a fitted control model: move vertices in folds onto the scan.
 
     Where the fit left the control mesh inside the scan, as in an armpit that is too high, no height reaches the
     surface. A round is kept only if less of the control mesh than before is folded or a hole.
     """
-    config = config or DisplacementConfig()
-    config = replace(config, size=min(config.size, 512))
     best, before, ready = control, np.inf, ReadyScan(scan)
-    for number in range(rounds + 1):
-        found = find_heights(control, ready, config)
+    for number in range(UNFOLDINGS + 1):
+        found = find_heights(control, ready, min(size, 512))
         bad = (found.folded | ~found.known) & found.texels.inside
         without = float(texel_areas(control, found.texels)[bad].sum() / control.mesh.face_areas.sum())
         if without >= before:
             break
         best, before = control, without
-        if number < rounds and without > 0:
-            drawn, u = bend_over_folds(Lattice(control), ready, found, config.reach)
+        if number < UNFOLDINGS and without > 0:
+            drawn, u = bend_over_folds(Lattice(control), ready, found)
             count = len(control.mesh.vertices)                   # the first of the lattice
             moved = np.where(drawn[:count, None], u[:count], 0)
             control = replace(control, mesh=control.mesh.with_vertices(control.mesh.vertices + moved))
@@ -228,7 +195,7 @@ def texel_areas(control: ControlModel, texels: Texels) -> np.ndarray:
     return (control.mesh.face_areas / np.maximum(pixel, 1e-12))[texels.faces]
 
 
-def bend_over_folds(lattice: Lattice, scan: ReadyScan, found: Heights, reach: float) -> tuple[np.ndarray, np.ndarray]:
+def bend_over_folds(lattice: Lattice, scan: ReadyScan, found: Heights) -> tuple[np.ndarray, np.ndarray]:
     """Bend the surface over folds onto the scan: which fine vertices (n,) moved, and displacements (n, 3), metres.
 
     Each vertex is attracted to the closest scan point with a compatible normal, and held by a thin-plate energy. That
@@ -247,7 +214,7 @@ def bend_over_folds(lattice: Lattice, scan: ReadyScan, found: Heights, reach: fl
     free = np.flatnonzero(drawn)
     if not len(free):
         return drawn, start - p
-    places, facing = _places(scan.mesh, start[free], reach)
+    places, facing = _places(scan.mesh, start[free])
     if not len(places):
         return drawn, start - p
     # thin-plate energy of the free vertices, and the pull of the fixed ones around them
@@ -262,7 +229,7 @@ def bend_over_folds(lattice: Lattice, scan: ReadyScan, found: Heights, reach: fl
     for stiffness in (100.0, 30.0, 10.0, 3.0, 1.0, 0.3, 0.1, 0.03):    # of the thin plate
         for _ in range(3):
             normals = Mesh(surface, fine.faces[used]).vertex_normals[free]
-            match = target.match(surface[free], normals, reach, 0.3)
+            match = target.match(surface[free], normals, REACH, 0.3)
             # into the planes through the matches, and no farther than SPACING from these
             q, m = places[match.index], facing[match.index]
             slip = surface[free] - q
@@ -286,10 +253,10 @@ def bend_over_folds(lattice: Lattice, scan: ReadyScan, found: Heights, reach: fl
     return drawn & better, np.where(better[:, None], surface, start) - p
 
 
-def _places(scan: Mesh, points: np.ndarray, reach: float) -> tuple[np.ndarray, np.ndarray]:
+def _places(scan: Mesh, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Sample the scan within reach of points, one point (m, 3) for a square of SPACING, with normals (m, 3)."""
     middle = scan.corners.mean(axis=1)
-    far = reach + np.sqrt(((scan.corners[:, 0] - middle)**2).sum(axis=1).max())
+    far = REACH + np.sqrt(((scan.corners[:, 0] - middle)**2).sum(axis=1).max())
     apart, _ = cKDTree(points).query(middle, distance_upper_bound=far, workers=search_threads(len(middle)))
     around = scan.submesh(np.flatnonzero(np.isfinite(apart)))[0]
     if not len(around.faces) or not around.face_areas.sum():

@@ -4,14 +4,12 @@
 displacement.tif       heights in metres, single precision, one channel
 displacement.png       heights in 16 bits of grey: `zero` is the value of height 0, `scale` is metres for a step
 coverage.png           8 bits: 255 measured, 170 folded, 85 hole, 0 outside the chart; so a hole is never a height
-vectors.tif            what is to be added to the heights in folds, in metres, single precision, three channels
 displacement.json      size, zero, scale and these four grey values
 =====================  =========================================================================================
 """
 from __future__ import annotations
 
 import io
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +22,7 @@ from scanprep.pictures import png16
 from ..control.model import FOLDED, HOLE, MEASURED, OUTSIDE, DisplacementMap
 
 HEADER, HEIGHTS, IMAGE = "displacement.json", "displacement.tif", "displacement.png"
-COVERAGE, VECTORS = "coverage.png", "vectors.tif"
+COVERAGE = "coverage.png"
 ZERO, LARGEST = 32768, 65535         # grey values of 16 bits: height 0 in the middle, so that both signs have room
 
 
@@ -37,10 +35,6 @@ def write_map(folder: str | Path, map: DisplacementMap) -> None:
     _write_tiff(folder / HEIGHTS, map.heights)
     _write_png(folder / IMAGE, grey)
     _write_png(folder / COVERAGE, map.coverage)
-    if map.vectors is None:
-        (folder / VECTORS).unlink(missing_ok=True)
-    else:
-        _write_tiff(folder / VECTORS, map.vectors)
     write_json(folder / HEADER, {"kind": "displacement map", "version": 1, "size": list(map.heights.shape),
                                  "zero": ZERO, "scale": scale, "coverage": {
                                      "measured": MEASURED, "folded": FOLDED, "hole": HOLE, "outside": OUTSIDE}})
@@ -59,13 +53,11 @@ def read_map(folder: str | Path, edited: str | Path | None = None) -> Displaceme
         if not scale > 0:
             raise ValueError(f"scale: expected a length above 0, got {scale}")
     heights, coverage = _read(folder / HEIGHTS, size, np.float32), _read(folder / COVERAGE, size, np.uint8)
-    vectors = _read(folder / VECTORS, (*size, 3), np.float32) if (folder / VECTORS).exists() else None
-    found = DisplacementMap(heights, coverage, vectors)
     if edited is None:
-        return found
+        return DisplacementMap(heights, coverage)
     stored, changed = _read(folder / IMAGE, size, np.uint16), read_edited(edited, size)
     change = np.where(changed != stored, scale * (changed.astype(float) - stored), 0)
-    return replace(found, heights=(heights + change).astype(np.float32))
+    return DisplacementMap((heights + change).astype(np.float32), coverage)
 
 
 def read_edited(path: str | Path, size: tuple[int, ...]) -> np.ndarray:
@@ -96,7 +88,7 @@ def _write_tiff(path: Path, image: np.ndarray) -> None:
 
     with writing(path) as beside:
         tifffile.imwrite(beside, image.astype(np.float32), compression="zlib",
-                         photometric="rgb" if image.ndim == 3 else "minisblack", metadata=None)
+                         photometric="minisblack", metadata=None)
 
 
 def _read(path: Path, size: tuple[int, ...], kind: Any) -> np.ndarray:

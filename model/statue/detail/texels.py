@@ -115,8 +115,8 @@ class Lattice:
     Holes are filled on three levels: edges of some 5 mm.
     """
 
-    def __init__(self, control: ControlModel, level: int = 3) -> None:
-        self.control, self.subdivision = control, subdivide_uniform(control.mesh, control.chart, level)
+    def __init__(self, control: ControlModel) -> None:
+        self.control, self.subdivision = control, subdivide_uniform(control.mesh, control.chart, 3)
         self.fine = self.subdivision.mesh(control.mesh)
         self._surface = Surface(self.fine)
 
@@ -161,8 +161,6 @@ def bake_texture(control: ControlModel, map: DisplacementMap, look: Look) -> np.
     texels = find_texels(control.mesh, control.chart, len(map.heights))
     p, n = interpolate(control.mesh, texels.faces, texels.bary)
     places = p + map.heights.ravel()[texels.pixels, None] * n
-    if map.vectors is not None:
-        places += map.vectors.reshape(-1, 3)[texels.pixels]
     colors, weight = look(places, n / np.maximum(np.linalg.norm(n, axis=1), 1e-12)[:, None])
     known = weight > 0
     if not known.all():

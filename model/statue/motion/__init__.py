@@ -1,1 +1,1 @@
-"""Motions for a statue: of its own parts, of other skeletons, of a learned model."""
+"""Motions for a statue: of its own parts and of other skeletons."""

@@ -1,4 +1,4 @@
-"""Motions of the synthetic people, of BVH files and of learned models, for a statue."""
+"""Motions of the synthetic people, of BVH files and of other skeletons, for a statue."""
 from __future__ import annotations
 
 from collections.abc import Callable
@@ -7,20 +7,13 @@ from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
-from scipy.sparse import coo_array, csr_array, diags_array, eye_array, vstack
+from scipy.sparse import coo_array, csr_array
 
-from scanprep.correspondence.correlated import find_correspondences
-from scanprep.geometry import rotations, sparse
-from scanprep.geometry.landmarks import match_landmarks
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.storage import StorageError, save_arrays, taking_apart
 from scanprep.geometry.surface import OrientedPoints, Surface
-from scanprep.registration.nonrigid import register, registration_problem
 from scanprep.skeleton.tree import Skeleton
 
-from ...body import BodyModel
-from ...fitting.vertices import fit_shape
-from ...linear import Subject
 from ...motion.amass import moving_body
 from ...motion.bvh import read_bvh
 from ...motion.files import StoredMotion, read_motion_file, skeleton_arrays
@@ -30,8 +23,6 @@ from ...motion.retarget import Pairing, Retargeted, retarget_pair
 from ...motion.same import copy_motion
 from ...rig import check_motion
 from ..control.model import ControlModel, Statue
-from ..detail.reconstruction import Reconstruction
-from ..detail.subdivision import subdivide_uniform
 
 
 def read_statue_motion(statue: Statue, path: Path, rate: float | None = None) -> tuple[Retargeted, list[str]]:
@@ -56,20 +47,9 @@ def read_statue_motion(statue: Statue, path: Path, rate: float | None = None) ->
         moving = set_in_motion(stored.skeleton, stored.poses, stored.trans, stored.rate)
         return _with_file_name(path, bvh_motion, control, statue.pose, moving), []
     if stored.of_family:
-        return _with_file_name(path, bvh_motion, control, statue.pose, moving_body(stored)), []
-    # files of older versions and of other programs do not hold their skeleton: only the kind and the count say whose
-    # they are
-    count, own, people = stored.poses.shape[1], len(parts.parents), 16
-    again = "make the file again (scape animate, scape demo), or bring BVH; for a learned model name it with --model"
-    if stored.made_for == "scape" or count not in (own, people):
-        raise StorageError(f"{path}: it does not say which skeleton its {count} parts are of, the statue has {own}; "
-                           f"{again}")
-    doubt = f"{path.name} does not say which skeleton it is of, and was taken for {{}} by its {count} parts; {again}"
-    if count == own:
-        whose = [] if stored.made_for == "skinning" else [doubt.format("a motion of the statue")]
-        return _own(control, path, stored), whose
-    return (people_motion(control, statue.pose, stored.poses, stored.trans, stored.rate),
-            [doubt.format("one of the synthetic people")])
+        return _with_file_name(path, bvh_motion, control, statue.pose, moving_body(stored)[0]), []
+    raise StorageError(f"{path}: it does not say which skeleton its {stored.poses.shape[1]} parts are of; make the "
+                       "file again (scape animate, scape demo), or bring BVH")
 
 
 def _with_file_name(path: Path, make: Callable[..., Retargeted], *given: object) -> Retargeted:
@@ -80,16 +60,12 @@ def _with_file_name(path: Path, make: Callable[..., Retargeted], *given: object)
         raise StorageError(f"{path}: {problem}") from None
 
 
-def own_motion(control: ControlModel, path: str | Path, rate: float | None = None) -> Retargeted:
-    """Read a motion file (`poses`, `trans`, `mocap_frame_rate`) of the statue's own parts.
+def _own(control: ControlModel, path: str | Path, stored: StoredMotion) -> Retargeted:
+    """Take a motion file (`poses`, `trans`, `mocap_frame_rate`) of the statue's own parts.
 
     In such files trans is the travel of the centroid of part 0, as in body models. Here it becomes that of the root's
     joint, as in a rig. Skinning moves one relative to the other a little.
     """
-    return _own(control, path, read_motion_file(path, rate=rate))
-
-
-def _own(control: ControlModel, path: str | Path, stored: StoredMotion) -> Retargeted:
     J, names = len(control.skeleton.parents), control.skeleton.names
     with taking_apart(path, f"a motion of the statue's {J} parts"):
         poses, trans = check_motion(control.skeleton, stored.poses, stored.trans, stored.rate)
@@ -98,7 +74,7 @@ def _own(control: ControlModel, path: str | Path, stored: StoredMotion) -> Retar
 
 
 def write_body_motion(path: str | Path, control: ControlModel, motion: Retargeted) -> None:
-    """Write a motion as `own_motion` reads it, with the array names that body-model files use."""
+    """Write a motion of the statue's own parts, with the array names that body-model files use."""
     arrays = {"poses": motion.poses.reshape(len(motion.poses), -1),
               "trans": motion.trans + middle_drift(control, motion.poses), "betas": np.zeros(0),
               "mocap_frame_rate": np.array(float(motion.rate)), "surface_model_type": np.array("skinning"),
@@ -115,14 +91,14 @@ def middle_drift(control: ControlModel, poses: np.ndarray) -> np.ndarray:
 
 
 def people_motion(control: ControlModel, pose: np.ndarray, poses: np.ndarray, trans: np.ndarray | None = None,
-                  rate: float = 60.0, girdle: float = 0.2) -> Retargeted:
+                  rate: float = 60.0) -> Retargeted:
     """Transfer a motion of the synthetic people, poses (T, 16, 3) and trans (T, 3), to a statue with its `pose`.
 
     The generic control model has the same rest pose, so world rotations of the parts are copied.
     """
     skeleton = _average_skeleton()
     moving = set_in_motion(skeleton, *check_motion(skeleton, poses, trans, rate), rate)
-    return retarget_pair(Pairing(control.skeleton, control.rig.vertices, moving, pose), True, girdle, True)
+    return retarget_pair(Pairing(control.skeleton, control.rig.vertices, moving, pose), True, here=True)
 
 
 @lru_cache(maxsize=1)
@@ -145,47 +121,6 @@ def bvh_motion(control: ControlModel, pose: np.ndarray, bvh: MovingSkeleton) -> 
     return same or retarget_pair(Pairing(control.skeleton, control.rig.vertices, bvh, pose), here=True)
 
 
-class BoundControl:
-    """A control mesh bound to the surface of a learned model's person, in the pose and place of the scan.
-
-    Each control vertex keeps its offset from the point of the surface that it is bound to, in axes that turn with the
-    edges around that point. `registered` (N, 3), the model's template on the scan, is nearer to it to find that point.
-    """
-
-    def __init__(self, mesh: Mesh, subject: Subject, pose: np.ndarray, trans: np.ndarray | None = None,
-                 registered: np.ndarray | None = None) -> None:
-        self.mesh, self.subject = mesh, subject
-        body = subject.template.with_vertices(subject.vertices(pose, trans))
-        if registered is not None and registered.shape != body.vertices.shape:
-            raise ValueError(f"registered: expected shape {body.vertices.shape}, got {registered.shape}")
-        near = body if registered is None else body.with_vertices(registered)
-        self._bind = bind_points(mesh, near)
-        # weights of the edges whose rotation is averaged around each vertex of the body: over four rings
-        N, edges = len(body.vertices), body.edges
-        ends = sparse.gatherer(edges.T.ravel(), N) @ vstack([eye_array(len(edges))] * 2)
-        ring = (body.vertex_adjacency != 0).astype(float) + eye_array(N)
-        ring = csr_array(diags_array(1 / ring.sum(axis=1)) @ ring)
-        self._around = csr_array(self._bind @ (ring @ (ring @ (ring @ ends))))
-        used = np.unique(self._around.indices)
-        self._around, self._edges = self._around[:, used], edges[used]
-        self._before = np.diff(body.vertices[self._edges], axis=1)[:, 0]
-        self._offset = mesh.vertices - self._bind @ body.vertices
-
-    def vertices(self, poses: np.ndarray, trans: np.ndarray | None = None) -> np.ndarray:
-        """Compute the control mesh (..., n, 3), metres, in poses (..., J, 3) of the model."""
-        if poses.ndim == 2:
-            return self._move(self.subject.vertices(poses, trans))
-        trans = np.broadcast_to(np.zeros(3) if trans is None else trans, (len(poses), 3))
-        return np.concatenate([[self._move(body) for body in self.subject.vertices(poses[k:k + 32], trans[k:k + 32])]
-                               for k in range(0, len(poses), 32)])
-
-    def _move(self, body: np.ndarray) -> np.ndarray:
-        body = np.asarray(body, dtype=np.float64)
-        outer = np.einsum("ea,eb->eab", np.diff(body[self._edges], axis=1)[:, 0], self._before).reshape(-1, 9)
-        R = rotations.project((self._around @ outer).reshape(-1, 3, 3))
-        return np.asarray(self._bind @ body + np.einsum("nab,nb->na", R, self._offset))
-
-
 def bind_points(mesh: Mesh, body: Mesh, farthest: float = np.inf) -> csr_array:
     """Bind each vertex to a body point with a compatible normal: barycentric weights (n, N).
 
@@ -203,26 +138,3 @@ def bind_points(mesh: Mesh, body: Mesh, farthest: float = np.inf) -> csr_array:
     n = len(mesh.vertices)
     return csr_array(coo_array((weights.ravel(), (np.repeat(np.arange(n), 3), corners.ravel())),
                                shape=(n, len(body.vertices))))
-
-
-def follower_of(statue: Statue, model: BodyModel, registered: np.ndarray | None = None,
-                progress: Callable[[int, int], None] | None = None) -> BoundControl:
-    """Bind the control mesh to a learned model, whose template is registered first, unless `registered` is given."""
-    control, pairs, hints = statue.control, None, None
-    if registered is None:
-        surface = Reconstruction(control, statue.map, subdivide_uniform(control.mesh, control.chart, 2)).mesh()
-        places = {name: control.mesh.vertices[vertex] for name, vertex in control.landmarks.items()}
-        try:
-            pairs = match_landmarks(model.info.get("landmarks") or {}, places, minimum=8)[1:]
-            pairs = pairs[0].astype(np.int64), pairs[1]
-        except ValueError:                   # other names, or none
-            hints = find_correspondences(model.template, surface)
-        found = register(model.template, surface, pairs, progress=progress, correspondences=hints)
-        problem = registration_problem(model.template, surface, found, pairs is not None)
-        if problem:
-            raise ValueError(f"model: its template could not be brought onto the statue, {problem}; register it to the "
-                             "scan with landmarks (scape prep register) and name the result with --registered")
-        registered = found.mesh.vertices
-    fit = fit_shape(model, registered)
-    subject = model.subject(fit.betas if model.n_betas else None)
-    return BoundControl(control.mesh, subject, fit.pose, fit.trans, registered)

@@ -1,39 +1,19 @@
 """Annealed soft assignment of the vertices of a model to several points of a scan each, nearer ones with more weight.
 
 The published slack of a point begins as its smallest match and is balanced. That removes distance from the assignment:
-m_ij becomes proportional to exp((d_max² - d_ij²) / T). With `slack="rest"` the slack is the remainder and costs
-nothing. Then m is the minimum of Eq. 15 under Σ_i m_ij <= 1, and tends to the closest points as T goes to 0. Where
-vertices outnumber their points, Eq. 14 has no solution. Rows are balanced last and sum to 1; `excess` is how much a
-point is assigned too often.
+m_ij becomes proportional to exp((d_max² - d_ij²) / T). Else the slack is the remainder and costs nothing. Then m is the
+minimum of Eq. 15 under Σ_i m_ij <= 1, and tends to the closest points as T goes to 0. Where vertices outnumber their
+points, Eq. 14 has no solution. Rows are balanced last and sum to 1.
 
 [Statues] Eq. 13-17
 """
 from __future__ import annotations
-
-from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 from scipy.sparse import csr_array
 from scipy.spatial import cKDTree
 
 from scanprep.threads import search_threads
-
-Slack = Literal["rest", "published"]
-
-
-@dataclass(frozen=True, eq=False)
-class SoftAssignment:
-    """How much every vertex is assigned to every point."""
-
-    matches: csr_array  # (I, J), rows sum to 1; the row of a vertex that knows no point is empty
-    slack: np.ndarray   # (J,), what is left of each point: 1 for a point that no vertex knows
-    excess: float       # most that a point is assigned beyond 1
-
-    @property
-    def seen(self) -> np.ndarray:
-        """(I,) bool: vertices that know a point."""
-        return np.diff(self.matches.indptr) > 0
 
 
 class DirectedPoints:
@@ -75,11 +55,13 @@ class DirectedPoints:
                 np.where(facing, np.take_along_axis(apart, order, axis=1) ** 2, np.inf))
 
 
-def assign_softly(near: np.ndarray, squared: np.ndarray, count: int, temperature: float, slack: Slack = "rest",
-                  tolerance: float = 0.01, most: int = 5) -> SoftAssignment:
+def assign_softly(near: np.ndarray, squared: np.ndarray, count: int, temperature: float, published: bool = False,
+                  tolerance: float = 0.01, most: int = 5) -> csr_array:
     """Balance a soft assignment of vertices to their nearest points (I, K), -1 for none, at one temperature (m²).
 
-    It ends when no share of a point changes by more than `tolerance` of itself.
+    It ends when no share of a point changes by more than `tolerance` of itself, or after `most` rounds. Returns the
+    matches (I, `count`), whose rows sum to 1; the row of a vertex that knows no point is empty. `published` takes the
+    paper's slack.
 
     [Statues] Eq. 14, 17
     """
@@ -96,17 +78,15 @@ def assign_softly(near: np.ndarray, squared: np.ndarray, count: int, temperature
         np.maximum.at(top, row, log_k + v[column])
         u = -np.where(np.isfinite(top), top, 0.0)
         M = csr_array((np.exp(log_k + u[row] + v[column]), (row, column)), shape=(len(near), len(used)))
-        a, b, changed = _balance(M, np.exp(np.minimum(-v, 50.0)) if slack == "rest" else None, log_s + v, tolerance)
+        a, b, changed = _balance(M, None if published else np.exp(np.minimum(-v, 50.0)), log_s + v, tolerance)
         u, v = u + np.log(a), v + np.log(b)
         if changed <= tolerance:
             break
     m = np.exp(log_k + u[row] + v[column])
-    matches = csr_array((m, (row, point)), shape=(len(near), count))
-    left = 1 - matches.sum(axis=0)
-    return SoftAssignment(matches, np.maximum(left, 0), float(max(0, -left.min())))
+    return csr_array((m, (row, point)), shape=(len(near), count))
 
 
-def _balance(M: csr_array, most: np.ndarray | None, log_s: np.ndarray, tolerance: float, rounds: int = 20
+def _balance(M: csr_array, most: np.ndarray | None, log_s: np.ndarray, tolerance: float
              ) -> tuple[np.ndarray, np.ndarray, float]:
     """Balance rows and columns: factors (I,) and (J,), rows last, and the largest relative change in the last round.
 
@@ -116,7 +96,7 @@ def _balance(M: csr_array, most: np.ndarray | None, log_s: np.ndarray, tolerance
     empty = np.diff(M.indptr) == 0
     b, changed = np.ones(M.shape[1]), np.inf
     a = 1 / np.where(empty, 1.0, M @ b)
-    for _ in range(rounds):
+    for _ in range(20):      # the caller goes on from there
         total, before = np.maximum(T @ a, 1e-250), b
         b = np.minimum(most, 1 / total) if most is not None else 1 / (np.exp(np.minimum(log_s, 300.0)) + total)
         a = 1 / np.where(empty, 1.0, M @ b)

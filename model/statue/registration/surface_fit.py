@@ -1,7 +1,7 @@
 """Fit of a control mesh to a scan: a shape-constrained deformable surface under annealed soft assignment.
 
-Beyond the paper, points of the scan attract the mesh as well (`cover`), and at the end vertices are attracted to the
-surface between the points (`polish`). At the edge of a hole the data act only across the surface.
+Beyond the paper, points of the scan attract the mesh as well, and at the end vertices are attracted to the surface
+between the points. At the edge of a hole the data act only across the surface.
 
 [Statues] section 4
 """
@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Annotated, Literal
 
 import numpy as np
 from scipy.sparse import csc_array, csr_array, diags_array, eye_array
@@ -18,60 +17,24 @@ from scanprep.geometry.mesh import Mesh, check_template
 from scanprep.geometry.sparse import Factored, conjugate_gradients
 from scanprep.geometry.surface import Surface, check_points
 from scanprep.geometry.target import Target, target_of
-from scanprep.ranges import Count, Positive, Range, Settings
 from scanprep.registration.folds import find_inverted_triangles, unfold
 from scanprep.threads import one_thread
 
 from ..detail.subdivision import divide_long_edges
 from .local_shape import local_shape
-from .soft_assignment import DirectedPoints, Slack, assign_softly
+from .soft_assignment import DirectedPoints, assign_softly
 
-
-@dataclass(frozen=True)
-class SurfaceFitConfig(Settings):
-    """Settings of `fit_surface`.
-
-    Attributes
-    ----------
-    step : "implicit" or "explicit"
-        Minimise the energy at a fixed assignment, or the published Euler steps.
-    shape : float
-        Weight of the local shape against the data; the paper has none, which is 1.
-    neighbours : int
-        Points of the scan that a vertex is assigned to.
-    slack : "rest" or "published"
-        What is left of a point of the scan costs nothing, or begins as its smallest match, as published.
-    cooling : float
-        Factor of the temperature from one stage to the next.
-    most : int
-        Steps at one temperature at most; ten times as many at the last.
-    cover : float
-        Weight of the other direction, in which points of the scan draw the nearest point of the control mesh, so that
-        it covers tips of limbs; all of them together weigh as much as this many times all vertices. The paper has none.
-    reach : float
-        Vertices farther from the scan have no data and are carried by the shape: an arm that was not scanned stays
-        where it was posed. A multiple of the root of the mesh's area; the paper has none.
-    polish : int
-        Rounds at the end in which vertices are drawn to the surface between the points of the scan; 0 leaves them out.
-    """
-
-    step: Literal["implicit", "explicit"] = "implicit"
-    shape: Positive = 1.0
-    neighbours: Count = 16
-    slack: Slack = "rest"
-    cooling: Annotated[float, Range(0.01, 0.99)] = 0.5
-    most: Count = 5
-    cover: float = 3.0
-    reach: Positive = 0.06
-    polish: int = 6
-
-    @classmethod
-    def from_paper(cls) -> SurfaceFitConfig:
-        """Return the paper's settings; cooling and steps, which it does not name, let the Euler steps converge.
-
-        Not as in the paper: the shape carries vertices past the edge of a hole of the scan.
-        """
-        return cls(step="explicit", slack="published", cover=0.0, polish=0, cooling=0.7, most=100, reach=10.0)
+NEIGHBOURS = 16                      # points of the scan that a vertex is assigned to: ten a vertex attract the mesh
+# Factor of the temperature from one stage to the next, and steps at one temperature, ten times as many at the last. The
+# paper names neither; the published Euler steps need the finer ones to converge.
+COOLING, STEPS = 0.5, 5
+PUBLISHED_COOLING, PUBLISHED_STEPS = 0.7, 100
+# All points of the scan together weigh as much as this many times all vertices, so that the mesh covers tips of limbs.
+COVER = 3.0
+# Vertices farther from the scan, in multiples of the root of the mesh's area, have no data: an arm that was not scanned
+# stays where it was posed. 8 cm on a person.
+REACH = 0.06
+POLISH = 6                           # rounds in which vertices are drawn to the surface between the points of the scan
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,13 +46,12 @@ class SurfaceFit:
     rms: float                # metres, distances of the vertices seen to the surface of the scan
     largest: float            # metres, the largest of them
     inverted: int             # triangles that face against their surroundings
-    temperatures: np.ndarray  # (K,) square metres
     converged: bool           # the longest gradient of a vertex fell below √T at the last temperature, and there were
                               # data; at a higher one the fit goes on, for the next has another minimum anyway
 
 
 @one_thread()
-def fit_surface(rest: Mesh, start: np.ndarray, scan: Mesh, config: SurfaceFitConfig | None = None,
+def fit_surface(rest: Mesh, start: np.ndarray, scan: Mesh, published: bool = False,
                 progress: Callable[[int, int], None] | None = None, hidden: np.ndarray | None = None) -> SurfaceFit:
     """Deform a control mesh until it lies on a scan, keeping its local shape and parameterisation.
 
@@ -101,8 +63,8 @@ def fit_surface(rest: Mesh, start: np.ndarray, scan: Mesh, config: SurfaceFitCon
         Its vertices near the scan.
     scan : Mesh
         The scan, which may have holes.
-    config : SurfaceFitConfig, optional
-        Settings.
+    published : bool
+        Take the paper's Euler steps under its slack, all vertices with data, in place of those that follow here.
     progress : callable, optional
         Called as progress(done, total).
     hidden : (N,) bool, optional
@@ -115,47 +77,47 @@ def fit_surface(rest: Mesh, start: np.ndarray, scan: Mesh, config: SurfaceFitCon
 
     [Statues] Eq. 6, 10, 11, 16, 18
     """
-    config = config or SurfaceFitConfig()
     check_template(rest, "rest")
     start = check_points(start, "start")
     if start.shape != rest.vertices.shape:
         raise ValueError(f"start: expected shape {rest.vertices.shape}, got {start.shape}")
     if not len(scan.faces):
         raise ValueError(f"scan: expected at least one triangle, got {scan}")
-    fit, report_progress = _Fit(rest, start, scan, config, hidden), progress or (lambda done, total: None)
+    report_progress = progress or (lambda done, total: None)
+    fit, steps = _Fit(rest, start, scan, published, hidden), PUBLISHED_STEPS if published else STEPS
+    rounds = 0 if published else POLISH
     x, temperatures = start, fit.schedule(start)
-    total = len(temperatures) + config.polish
+    total = len(temperatures) + rounds
     for k, T in enumerate(temperatures, 1):
-        most = config.most if k < len(temperatures) else 10 * config.most
+        most = steps if k < len(temperatures) else 10 * steps
         x, converged = fit.anneal(x, T, most)                                                  # [Statues] Eq. 16-18
         report_progress(k, total)
-    for k in range(config.polish):
+    for k in range(rounds):
         x = fit.polish(x)
         report_progress(len(temperatures) + k + 1, total)
-    if config.polish:
+    if rounds:
         x = fit.onto_the_surface(x)
     seen, _ = fit.find_data(x)
     apart, inverted = fit.surface.closest(x).distances[seen], int(find_inverted_triangles(rest, x).sum())
     return SurfaceFit(x, seen, float(np.sqrt(np.mean(apart**2))) if seen.any() else np.nan,
-                      float(apart.max(initial=0.0)), inverted, temperatures, bool(converged and seen.any()))
+                      float(apart.max(initial=0.0)), inverted, bool(converged and seen.any()))
 
 
 class _Fit:
     """The data of a surface fit of vertices x (N, 3), and its steps."""
 
-    def __init__(self, rest: Mesh, start: np.ndarray, scan: Mesh, config: SurfaceFitConfig, hidden: np.ndarray | None
-                 ) -> None:
+    def __init__(self, rest: Mesh, start: np.ndarray, scan: Mesh, published: bool, hidden: np.ndarray | None) -> None:
         # ten points of the scan for each vertex attract the mesh; long triangles would do so by their corners only
         spacing = max(float(np.sqrt(float(scan.face_areas.sum()) / (10 * len(start)))), 1e-4)
         scan = divide_long_edges(scan, 2 * spacing)
         target = scan_target(scan)
-        self.rest, self.target, self.surface, self.config = rest, target, Surface(scan), config
+        self.rest, self.target, self.surface, self.published = rest, target, Surface(scan), published
         self.shape = local_shape(rest)
         self.points = DirectedPoints(target.points, target.normals, target.border)
         self.stiffness = csc_array(self.shape.plane.T @ diags_array(self.shape.weights) @ self.shape.plane)
         self.sample = target.thin(spacing)
         self.shown = np.ones(len(start), dtype=bool) if hidden is None else ~np.asarray(hidden)
-        self.reach = config.reach * float(np.sqrt(rest.with_vertices(start).face_areas.sum()))
+        self.reach = np.inf if published else REACH * float(np.sqrt(rest.with_vertices(start).face_areas.sum()))
 
     def normals(self, x: np.ndarray) -> np.ndarray:
         """Compute the normals (N, 3) of the vertices."""
@@ -166,21 +128,20 @@ class _Fit:
         final = 0.001**2
         near, squared = self.points.nearest(x, self.normals(x), 1)
         first = max(float(squared[self.beside_data(x, near[:, 0]), 0].max(initial=0.0)), final)
-        stages = int(np.ceil(np.log(final / first) / np.log(self.config.cooling))) + 1
+        stages = int(np.ceil(np.log(final / first) / np.log(PUBLISHED_COOLING if self.published else COOLING))) + 1
         return np.geomspace(first, final, stages)
 
     def anneal(self, x: np.ndarray, T: float, most: int) -> tuple[np.ndarray, bool]:
         """Take steps at one temperature until the gradient is below √T; return vertices and whether it converged."""
-        explicit, lam = self.config.step == "explicit", self.config.shape
         for count in range(most + 1):
             matches, A = self.assignment(x, T)                                             # [Statues] Eq. 14, 15, 17
             wanted = matches @ self.points.points
-            data = self.undrawn(A, wanted) if explicit else self.find_matches(x, A, wanted)           # [Statues] Eq. 13
-            force = data.force(x) + lam * (self.shape.paper_force(x) if explicit else -0.5 * self.shape.gradient(x))
+            data = self.find_matches(x, A, wanted)                                          # [Statues] Eq. 13
+            force = data.force(x) + (self.shape.paper_force(x) if self.published else -0.5 * self.shape.gradient(x))
             converged = bool(np.linalg.norm(force, axis=1).max() <= np.sqrt(T))
             if (converged and count) or count == most:
                 break
-            x = x + 0.5 * force if explicit else self.step(x, data, force)                  # [Statues] Eq. 18
+            x = x + 0.5 * force if self.published else self.step(x, data, force)                  # [Statues] Eq. 18
         return x, converged
 
     def assignment(self, x: np.ndarray, T: float) -> tuple[csr_array, np.ndarray]:
@@ -189,13 +150,13 @@ class _Fit:
         The weight is zero without data. At the edge of a hole all points lie to one side, and their mean would pull the
         mesh off the hole; so there it acts only along the normal.
         """
-        near, squared = self.points.nearest(x, self.normals(x), self.config.neighbours)
+        near, squared = self.points.nearest(x, self.normals(x), NEIGHBOURS)
         near[~self.beside_data(x, near[:, 0])] = -1
-        found = assign_softly(near, squared, len(self.points.points), T, self.config.slack)
+        matches = assign_softly(near, squared, len(self.points.points), T, self.published)
         n = self.points.normals[near[:, 0]]
         edge = (self.points.border[near] & (near >= 0)).any(axis=1)
         A = np.where(edge[:, None, None], np.einsum("ni,nj->nij", n, n), np.eye(3))
-        return found.matches, found.seen[:, None, None] * A
+        return matches, (np.diff(matches.indptr) > 0)[:, None, None] * A
 
     def beside_data(self, x: np.ndarray, nearest: np.ndarray) -> np.ndarray:
         """Find vertices with data, (N,) bool: shown, near their nearest point, not past the edge of a hole."""
@@ -207,14 +168,13 @@ class _Fit:
         nearest = self.points.nearest(x, self.normals(x), 1)[0][:, 0]
         return self.beside_data(x, nearest), nearest
 
-    def undrawn(self, A: np.ndarray, wanted: np.ndarray) -> SurfaceData:
-        """Build the data term that attracts vertices to `wanted` (N, 3) with weights A (N, 3, 3) alone."""
-        return SurfaceData(A, wanted, csc_array((0, len(wanted))), np.zeros((0, 3)), 0.0)
-
     def find_matches(self, x: np.ndarray, A: np.ndarray, wanted: np.ndarray) -> SurfaceData:
-        """Build the data term in which scan points also attract the mesh, where both face the same way."""
-        if not self.config.cover:
-            return self.undrawn(A, wanted)
+        """Build the data term that attracts vertices to `wanted` (N, 3) with weights A (N, 3, 3).
+
+        Unless as published, scan points also attract the mesh, where both face the same way.
+        """
+        if self.published:
+            return SurfaceData(A, wanted, csc_array((0, len(wanted))), np.zeros((0, 3)), 0.0)
         mesh = self.rest.with_vertices(x)
         found = Surface(mesh).closest(self.sample.points)
         corners = mesh.faces[found.faces]
@@ -223,18 +183,18 @@ class _Fit:
         good = np.flatnonzero(facing & self.shown[corners].all(axis=1))
         rows = np.repeat(np.arange(len(good)), 3)
         C = csc_array((found.bary[good].ravel(), (rows, corners[good].ravel())), shape=(len(good), len(x)))
-        return SurfaceData(A, wanted, C, self.sample.points[good], self.config.cover * len(x) / len(found.faces))
+        return SurfaceData(A, wanted, C, self.sample.points[good], COVER * len(x) / len(found.faces))
 
     def step(self, x: np.ndarray, data: SurfaceData, force: np.ndarray) -> np.ndarray:
         """Take a Gauss-Newton step on local shape and data; `force` is minus half the gradient."""
         # conjugate gradients on the exact matrix, preconditioned by one that is the same for all coordinates
-        shape, w, lam = self.shape, self.shape.weights[:, None], self.config.shape
-        nearly = Factored(csc_array(lam * self.stiffness + data.bound + 1e-6 * lam * eye_array(len(x))))
-        d = conjugate_gradients(lambda d: lam * shape.apply_transpose(x, w * shape.derivative(x, d)) + data.apply(d),
+        shape, w = self.shape, self.shape.weights[:, None]
+        nearly = Factored(csc_array(self.stiffness + data.bound + 1e-6 * eye_array(len(x))))
+        d = conjugate_gradients(lambda d: shape.apply_transpose(x, w * shape.derivative(x, d)) + data.apply(d),
                                 force, nearly.solve, 30, 1e-2)
 
         def energy(x: np.ndarray) -> float:
-            return lam * shape.energy(x) + data.energy(x)
+            return shape.energy(x) + data.energy(x)
 
         length = 1.0
         while energy(x + length * d) > energy(x) and length > 1e-3:
@@ -249,7 +209,7 @@ class _Fit:
         y = np.where(wrong[:, None], self.target.points[near], found.points)
         A = np.einsum("ni,nj->nij", n, n) + 0.05 * np.eye(3)                # little force along the surface
         data = self.find_matches(x, 100.0 * seen[:, None, None] * A, y)
-        return self.step(x, data, data.force(x) - 0.5 * self.config.shape * self.shape.gradient(x))
+        return self.step(x, data, data.force(x) - 0.5 * self.shape.gradient(x))
 
     def onto_the_surface(self, x: np.ndarray) -> np.ndarray:
         """Move vertices with data onto the surface, where that inverts no triangle."""
