@@ -59,7 +59,7 @@ def quick(tmp_path, monkeypatch):
     for place in (registration_cli, unmarked):
         monkeypatch.setattr(place, "register", few_steps)
     path = tmp_path / "quick.toml"
-    config = replace(QUICK, min_poses=5, scan=replace(QUICK.scan, pictures=True))
+    config = replace(QUICK, min_poses=5)
     path.write_text(config_files.write_settings({"config": config}))
     return path
 

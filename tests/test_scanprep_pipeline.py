@@ -160,7 +160,8 @@ def test_only_what_has_changed_is_done_again(scans, template, tmp_path):
     done = prepare(find_scans(scans), template, MARKS, tmp_path / "set", QUICK)
     assert done.fresh == 1
     changed = {name for name, data in contents(tmp_path / "set").items() if data != before[name]}
-    assert changed == {"meshes/body1.ply", "registration.csv", "report.html"}
+    assert changed == {"meshes/body1.ply", "pictures/body1.webp", "pictures/body1.scene", "registration.csv",
+                       "report.html"}
 
 
 def test_interrupted_keeps_what_was_done(scans, template, tmp_path):

@@ -29,7 +29,7 @@ from scanprep.skeleton.tree import Skeleton
 BAD = "scan6", "scan7"                  # which the first registrations do not find
 FAR_ARMS = 1.15 * np.array(FAR)          # so far that 41% of the surface of scan6 stays off the template
 QUICK = RegistrationConfig(tuple(replace(stage, nodes=60, ends=0) for stage in RegistrationConfig().near_stages[:3]))
-CONFIG = PrepareConfig(ScanSettings(QUICK, pictures=False), min_poses=5, workers=Workers(1))
+CONFIG = PrepareConfig(ScanSettings(QUICK), min_poses=5, workers=Workers(1))
 
 
 @pytest.fixture

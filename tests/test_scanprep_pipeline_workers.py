@@ -9,7 +9,7 @@ import time
 from pathlib import Path
 
 import pytest
-from scan_folders import MARKS, QUICK, WITH_PICTURES, contents, write_scans
+from scan_folders import MARKS, QUICK, contents, write_scans
 from test_scanprep_pipeline import ball_template, three_scans  # noqa: F401 -- fixtures
 
 from scanprep.batch import cluster
@@ -26,7 +26,7 @@ def six(tmp_path_factory, template):
     place = tmp_path_factory.mktemp("six")
     scans = write_scans(place / "scans", template, 6)
     (scans / "body3.ply").write_bytes((scans / "body3.ply").read_bytes()[:-50])
-    done = prepare(find_scans(scans), template, MARKS, place / "one" / "set", WITH_PICTURES)
+    done = prepare(find_scans(scans), template, MARKS, place / "one" / "set", QUICK)
     assert len(done.figures) == 5 and len(done.failures) == 1
     return scans, place / "one" / "set"
 
@@ -48,7 +48,7 @@ def test_killed_in_the_middle_and_started_again(six, template, tmp_path, sign):
     if sign == signal.SIGINT:
         assert 'id="scan-' in (tmp_path / "set" / "report.html").read_text()
     stamps = {name: (tmp_path / "set" / "meshes" / f"{name}.ply").stat().st_mtime_ns for name in done}
-    again = prepare(find_scans(scans), template, MARKS, tmp_path / "set", WITH_PICTURES)
+    again = prepare(find_scans(scans), template, MARKS, tmp_path / "set", QUICK)
     assert again.fresh == 5 - len(done)
     assert {name: (tmp_path / "set" / "meshes" / f"{name}.ply").stat().st_mtime_ns for name in done} == stamps
     assert contents(tmp_path / "set") == contents(whole)
@@ -61,7 +61,7 @@ def finished(folder):
 @pytest.mark.slow
 def test_processes_change_nothing(six, template, tmp_path):
     scans, whole = six
-    two = dataclasses.replace(WITH_PICTURES, workers=Workers(2))
+    two = dataclasses.replace(QUICK, workers=Workers(2))
     done = prepare(find_scans(scans), template, MARKS, tmp_path / "set", two)
     assert "body3.ply" in done.failures[0]
     assert contents(tmp_path / "set") == contents(whole)
@@ -84,7 +84,7 @@ def test_a_cluster_changes_nothing(six, template, tmp_path, processes, seen, mon
             monkeypatch.undo()
         if not seen:
             monkeypatch.setattr(cluster, "_has_same_files", lambda client, given: False)
-        config = dataclasses.replace(WITH_PICTURES, workers=Workers(local.scheduler_address))
+        config = dataclasses.replace(QUICK, workers=Workers(local.scheduler_address))
         prepare(find_scans(scans), template, MARKS, tmp_path / "set", config)
     assert contents(tmp_path / "set") == contents(whole)
 
