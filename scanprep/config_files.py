@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from .geometry import storage
-from .ranges import FLAG, OutOfRangeError, Settings, marks
+from .ranges import FLAG, NO_FLAGS, OutOfRangeError, Settings, marks
 
 Path_ = tuple[str, ...]              # path of a field: parameter, then names of nested settings
 
@@ -55,7 +55,7 @@ def _flags(path: Path_, config: Settings) -> Iterator[Flag]:
         value = getattr(config, field.name)
         if FLAG in marks(hints[field.name]):
             yield Flag((*path, field.name), hints[field.name], value, sentences.get(field.name, ""))
-        elif isinstance(value, Settings):
+        elif isinstance(value, Settings) and NO_FLAGS not in marks(hints[field.name]):
             yield from _flags((*path, field.name), value)
 
 

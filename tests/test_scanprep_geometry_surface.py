@@ -51,12 +51,6 @@ def test_a_surface_point_is_carried_with_its_triangle():
     np.testing.assert_allclose(carried, found.points @ A.T + t, atol=1e-12)
 
 
-def test_points_on_the_surface_are_at_distance_zero():
-    mesh = ball(2)
-    points, _, _ = mesh.sample(500, RNG(3))
-    assert Surface(mesh).closest(points).distances.max() < 1e-9
-
-
 def test_barycentric_coordinates_come_back_and_flat_triangles_give_their_first_corner():
     corners, bary = RNG(4).normal(size=(200, 3, 3)), RNG(5).dirichlet((1, 1, 1), 200)
     points = np.einsum("nc,ncd->nd", bary, corners)
@@ -153,10 +147,3 @@ def test_without_triangles_nothing_is_nearest_and_nothing_is_hit(vertices):
         warnings.simplefilter("error")
         face, distance = Rays(bare).cast(points, -points)
     assert face.tolist() == [-1] and np.isnan(distance).all()
-
-
-def test_no_points_have_no_answers_and_one_point_is_no_row_of_points():
-    none = np.zeros((0, 3))
-    assert len(Surface(ball()).closest(none).faces) == len(Rays(ball()).cast(none, none)[0]) == 0
-    with pytest.raises(ValueError, match=r"points: expected points of shape \(n, 3\), got shape \(3,\)"):
-        Surface(ball()).closest(np.zeros(3))

@@ -89,37 +89,6 @@ def test_a_cluster_changes_nothing(six, template, tmp_path, processes, seen, mon
     assert contents(tmp_path / "set") == contents(whole)
 
 
-def test_shipped_files_need_no_folder(scans, template):
-    task, shared = find_scans(scans)[0], pickle.dumps((RegisterScan(template, MARKS, QUICK.scan), cluster._versions()))
-    there = dataclasses.replace(task, scan=Path("/no/such/body0.ply"), landmarks=Path("/no/such/body0.landmarks.json"))
-    files = {there.scan: task.scan.read_bytes(), there.landmarks: task.landmarks.read_bytes()}
-    assert cluster._files(task) == {task.scan: files[there.scan], task.landmarks: files[there.landmarks]}
-    figures, made, _ = cluster.do_there(shared, pickle.dumps(("scans/body0", "", there, files)))
-    assert figures.name == "body0" and set(made) == {"meshes/body0.ply"} and figures.distance < 0.001
-    files[there.scan] = files[there.scan][:-9]
-    failed, made, _ = cluster.do_there(shared, pickle.dumps(("scans/body0", "", there, files)))
-    assert failed.reason.startswith("/no/such/body0.ply: ") and not made
-
-
-class Noticing:
-    """Work that says something of its file."""
-
-    def __call__(self, given, room):
-        (room.folder / "made.txt").write_text("")
-        warn_of(f"{given}: its rate is 0")
-
-
-def warn_of(text):
-    exec(compile("import warnings; warnings.warn(text, stacklevel=1)", "tried", "exec"),
-         {"__name__": "scanprep.tried", "text": text})
-
-
-def test_what_a_worker_noticed_is_told_here_with_our_paths(tmp_path):
-    path = Path("/no/such/walk.c3d")
-    shared, job = pickle.dumps((Noticing(), cluster._versions())), ("walk", "", path, {path: b"data"})
-    assert cluster.do_there(shared, pickle.dumps(job)) == (None, {"made.txt": b""}, [f"{path}: its rate is 0"])
-
-
 def test_no_scheduler(scans, template, tmp_path, monkeypatch):
     monkeypatch.setattr(cluster, "ANSWER", 1)
     config = dataclasses.replace(QUICK, workers=Workers("tcp://127.0.0.1:1"))
@@ -131,16 +100,6 @@ def test_workers_of_another_version(scans, template):
     shared = pickle.dumps((RegisterScan(template, MARKS, QUICK.scan), {"scapekit": "0.0.0", "numpy": "1"}))
     with pytest.raises(RuntimeError, match=r"the worker has scapekit .*sources [0-9a-f]{12} and numpy"):
         cluster.do_there(shared, pickle.dumps(("body0", "", find_scans(scans)[0], None)))
-
-
-def test_a_scheduler_needs_nothing_of_ours():
-    """It unpacks the function and its arguments; ours would have to be installed there too."""
-    import cloudpickle
-
-    code = f"import pickle, sys\npickle.loads({cloudpickle.dumps(cluster._entrance())!r})\nassert not any(" \
-           "name.split('.')[0] == 'scanprep' for name in sys.modules)"
-    done = subprocess.run([sys.executable, "-c", code], cwd="/", capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr
 
 
 @dataclasses.dataclass(frozen=True)
