@@ -71,14 +71,6 @@ def report(path):
     return {m["metric"]: m["value"] for m in json.loads(Path(path).read_text())["metrics"]}
 
 
-@pytest.mark.parametrize("command", COMMANDS)
-def test_every_command_explains_itself(command, capsys):
-    with pytest.raises(SystemExit) as stop:
-        run(command, "--help")
-    shown = " ".join(capsys.readouterr().out.replace("│", " ").split())
-    assert stop.value.code == 0 and f"Example: scape prep {command} " in shown
-
-
 def test_help_answers_at_once():
     """Nothing that takes long is imported for it; the time itself is for the benchmarks."""
     code = ("import sys\nfrom completion.__main__ import main\nassert main(['prep', '--help']) == 0\n"

@@ -124,12 +124,6 @@ def test_an_off_header_glued_to_its_counts(tmp_path):
     np.testing.assert_array_equal(read_mesh(tmp_path / "a.off").corners, [SQUARE[:3]])
 
 
-def test_one_colour_that_is_no_number_leaves_out_all(tmp_path):
-    (tmp_path / "a.obj").write_text("v 0 0 0 1 nan 1\nv 1 0 0 1 1 1\nv 0 1 0 1 1 1\nf 1 2 3\n")
-    with pytest.warns(UserWarning, match="all colours were left out"):
-        assert read_mesh(tmp_path / "a.obj").colors is None
-
-
 POINTS = [[1.5, 2.5, 3.5], [-1, 0.25, 2e-3]]
 
 

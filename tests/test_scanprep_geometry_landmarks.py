@@ -373,13 +373,6 @@ def test_landmarks_in_another_unit_than_the_scan_are_brought_onto_it(tmp_path, r
     assert len(said) == bool(factor) and all(f"multiplied by {factor} they do" in line for line in said), said
 
 
-def test_landmarks_that_lie_on_no_scan_of_any_unit_stay_as_they_are(tmp_path, recwarn):
-    scan = np.random.default_rng(0).normal(size=(2000, 3)) * [0.1, 0.3, 0.6]
-    far = {"a": [9.0, 1.0, 0.0], "b": [9.0, 2.0, 1.0], "c": [8.0, 1.0, 3.0]}
-    found = read_landmarks(written(tmp_path / "a.json", far), scan)
-    assert all((found[name] == far[name]).all() for name in far) and not recwarn.list
-
-
 def test_axes_that_a_slicer_file_tells_are_doubted_only_where_the_others_fit_far_better(tmp_path):
     """A body looks alike from in front and behind: few triangles, and clicks between their corners, tell nothing."""
     body = decimate(SyntheticPerson().mesh, 300)

@@ -80,22 +80,6 @@ def test_frames_that_share_unknowns_are_solved_as_one_system(damping):
     np.testing.assert_allclose(gain, loss, rtol=1e-6)
 
 
-def test_rows_of_an_arrow_go_on_sharing():
-    A, b = RNG.normal(size=(3, 8, 5)), RNG.normal(size=(3, 8))
-
-    def equations(x):
-        return Arrow(normal_equations([Residual(np.einsum("bmp,bp->bm", A, x) - b, A)]), 2)
-
-    end = levenberg_marquardt(equations, np.zeros((3, 5)), 40)
-    whole = np.zeros((24, 11))
-    for i in range(3):
-        whole[8 * i:8 * i + 8, 3 * i:3 * i + 3], whole[8 * i:8 * i + 8, 9:] = A[i, :, :3], A[i, :, 3:]
-    best = np.linalg.lstsq(whole, b.ravel(), rcond=None)[0]
-    assert end.converged.all()
-    np.testing.assert_allclose(end.x[:, :3].ravel(), best[:9], atol=1e-4)
-    np.testing.assert_allclose(end.x[:, 3:], np.tile(best[9:], (3, 1)), atol=1e-4)
-
-
 def test_rotations_are_found_that_lie_far_away():
     """Wahba's problem, from identity to turns near π, against the solution by singular values."""
     points, R = RNG.normal(size=(5, 12, 3)), rotations.exp(3.1 * rotations.project(RNG.normal(size=(5, 3, 3)))[:, 0])

@@ -112,12 +112,6 @@ def test_manifold_predicates_agree_with_igl(mesh):
     assert mesh.is_closed == (len(mesh.boundary_loops) == 0)
 
 
-def test_a_fin_and_a_flipped_triangle_are_not_manifold():
-    fin = Mesh([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, 1]], [[0, 1, 2], [1, 0, 3], [0, 1, 4]])
-    flipped = Mesh([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, -1, 0]], [[0, 1, 2], [0, 1, 3]])
-    assert not fin.is_edge_manifold and not flipped.is_edge_manifold and fin.edge_use.max() == 3
-
-
 @every
 def test_submesh_keeps_its_triangles(mesh):
     keep = RNG(3).random(len(mesh.faces)) < 0.4
@@ -176,8 +170,3 @@ def test_what_is_no_template_and_why(mesh, says):
     assert says in (template_problem(mesh) or "")
     with pytest.raises(ValueError, match=f"scan7: not usable as a template, .*{says}"):
         check_template(mesh, "scan7")
-
-
-def test_vertices_without_triangles_have_no_normal():
-    """Where a file holds points alone; sums over no triangle are whole numbers."""
-    assert not Mesh(np.eye(3), np.zeros((0, 3), dtype=np.int64)).vertex_normals.any()

@@ -54,16 +54,6 @@ def test_log_near_zero_keeps_its_digits():
         np.testing.assert_allclose(rotations.log(rotations.exp(t)), t, rtol=1e-6, atol=1e-16)
 
 
-def test_leading_dimensions_are_kept():
-    t = np.random.default_rng(0).normal(size=(2, 4, 3))
-    R = rotations.exp(t)
-    assert R.shape == (2, 4, 3, 3)
-    for i in range(2):
-        for j in range(4):
-            np.testing.assert_array_equal(R[i, j], rotations.exp(t[i, j]))
-    np.testing.assert_allclose(rotations.log(R).shape, t.shape)
-
-
 @given(twists(), direction)
 def test_a_rotation_is_active_and_right_handed(t, x):
     np.testing.assert_allclose(rotations.exp(t) @ x, Rotation.from_rotvec(t).apply(x), atol=1e-12)
@@ -114,11 +104,6 @@ def test_many_projections_are_those_of_each_alone():
     every = rotations.project(M)
     alone = np.stack([rotations.project(m[None])[0] for m in M.reshape(-1, 3, 3)]).reshape(M.shape)
     np.testing.assert_allclose(every, alone, atol=1e-9)
-
-
-def test_mean_of_rotations_about_one_axis_is_the_middle():
-    R = rotations.exp(np.outer([0.1, 0.3, 0.5], [0, 1, 0]))
-    np.testing.assert_allclose(rotations.log(rotations.mean(R)), [0, 0.3, 0], atol=1e-12)
 
 
 @given(twists(), st.integers(3, 20), st.integers(0, 1000))

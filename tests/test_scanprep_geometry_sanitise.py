@@ -6,7 +6,7 @@ from scanned_shapes import ball
 
 from scanprep.cleaning.clean_scan import clean_scan
 from scanprep.geometry.mesh import Mesh, template_problem
-from scanprep.geometry.places import distinct_places, distinct_rows, spacing
+from scanprep.geometry.places import spacing
 from scanprep.geometry.sanitise import _agree_with_camera, invert_triangles, sanitise
 from scanprep.geometry.surface import Rays
 from scanprep.geometry.target import target_of
@@ -132,17 +132,6 @@ def test_points_that_are_there_twice_are_there_once(person):
     rng = np.random.default_rng(0)
     overlapping = np.concatenate([points, points + 1e-6 * rng.normal(size=points.shape)])
     assert spacing(overlapping) == pytest.approx(spacing(points), rel=0.02)
-
-
-def test_rows_that_differ_are_told_apart():
-    rng = np.random.default_rng(0)
-    rows = rng.integers(0, 4, (500, 3)).astype(float)
-    rows[rows == 0] *= rng.choice([-1, 1], (rows == 0).sum())                 # minus zero is zero
-    first = {}
-    expected = [first.setdefault(tuple(row + 0.0), i) for i, row in enumerate(rows)]
-    assert distinct_rows(rows).tolist() == expected
-    assert distinct_places(rows).tolist() == sorted(first.values())
-    assert distinct_rows(np.unique(rows, axis=0)) is None
 
 
 @pytest.mark.parametrize("front", [1, 2, 8])

@@ -94,19 +94,6 @@ def test_a_scan_that_fails_gets_no_file_and_stops_no_other(scans, template, tmp_
     assert {row["scan"] for row in rows_of(output)} == {"body0", "body2"}
 
 
-def test_what_is_done_is_not_done_again(scans, template, tmp_path):
-    output = tmp_path / "points"
-    with workspace(output) as space:
-        write_all(find_scans(scans)[1:], template, MARKS, NEAR_POSE, "json", space)
-    written = {path: path.stat().st_mtime_ns for path in output.rglob("body*") if path.is_file()}
-    outcome = write_points(scans, template, output)
-    assert value(outcome, "registered in this run") == 1 and len(rows_of(output)) == 15
-    assert written and all(path.stat().st_mtime_ns == time for path, time in written.items())
-    before = {path: path.stat().st_mtime_ns for path in output.glob("body*")}
-    assert value(write_points(scans, template, output), "registered in this run") == 0
-    assert {path: path.stat().st_mtime_ns for path in output.glob("body*")} == before
-
-
 def test_what_has_no_data_is_guessed_and_stays_out_of_the_files(scans, template, tmp_path):
     """The end of a body is missing in a mesh; a cloud is landmarked on its points."""
     whole = read_mesh(scans / "body0.ply")

@@ -16,11 +16,9 @@ from scanprep.batch.ownership import HOME, ForeignFileError
 from scanprep.batch.pool import Workers
 from scanprep.cleaning.clean_scan import CleanScanConfig
 from scanprep.correspondence.correspondences import Correspondences
-from scanprep.pipeline import scan as one_scan
 from scanprep.pipeline.prepare import prepare
 from scanprep.pipeline.scans import find_scans
 from scanprep.registration import unmarked
-from scanprep.registration.nonrigid import LedRegistration, register
 
 
 @pytest.fixture(name="template", scope="module")
@@ -123,18 +121,6 @@ def test_only_what_has_changed_is_done_again(scans, template, tmp_path):
                        "report.html"}
 
 
-def test_interrupted_keeps_what_was_done(scans, template, tmp_path):
-    def stop(done, total):
-        if done == 1:
-            raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        prepare(find_scans(scans), template, MARKS, tmp_path / "set", QUICK, stop)
-    assert len(RegisteredSet.load(tmp_path / "set").entries) == 1
-    done = prepare(find_scans(scans), template, MARKS, tmp_path / "set", QUICK)
-    assert len(done.figures) == 3
-
-
 def test_two_runs_in_one_folder(scans, template, tmp_path):
     prepare(find_scans(scans)[:1], template, MARKS, tmp_path / "set", QUICK)
     before = contents(tmp_path / "set")
@@ -215,24 +201,6 @@ def test_clutter_is_cleaned_off_when_asked(scans, template, tmp_path):
     assert plain.missed == pytest.approx(0.04 / 1.04, abs=0.002) and clean.missed == 0
 
 
-def test_little_clutter_is_taken_off_scans_without_landmarks(scans, template, tmp_path, monkeypatch):
-    """A person who clicked landmarks saw the scan; nobody saw this one."""
-    body = read_mesh(scans / "body0.ply")
-    box = Mesh(np.array([[0, 0, 0], [0.1, 0, 0], [0, 0.1, 0], [0, 0, 0.1]]) + 2,
-               np.array([[0, 2, 1], [0, 1, 3], [1, 2, 3], [0, 3, 2]]))
-    write_mesh(scans / "body0.ply", Mesh(np.vstack([body.vertices, box.vertices]),
-                                         np.vstack([body.faces, box.faces + len(body.vertices)])))
-    seen = []
-    fit = register(template, template, start=template.vertices, config=QUICK.scan.registration)
-    monkeypatch.setattr(one_scan, "register_by_any",
-                        lambda template, scan, *given: seen.append(len(scan.vertices)) or LedRegistration(fit, "none"))
-    clicked = prepare(find_scans(scans)[:1], template, MARKS, tmp_path / "clicked", QUICK).figures[0]
-    (scans / "body0.landmarks.json").unlink()
-    alone = prepare(find_scans(scans)[:1], template, MARKS, tmp_path / "alone", QUICK).figures[0]
-    assert seen == [len(body.vertices) + 4, len(body.vertices)]
-    assert clicked.removed == 0 and alone.removed == pytest.approx(4 / (len(body.vertices) + 4))
-
-
 @pytest.mark.slow
 def test_other_settings_or_template_do_all_anew(scans, template, tmp_path):
     tasks = find_scans(scans)[:2]
@@ -275,13 +243,6 @@ def test_what_the_user_put_there_is_left_alone(scans, template, tmp_path):
     done = prepare(find_scans(scans), template, MARKS, tmp_path / "set", QUICK)
     assert "body1.ply: in the way" in done.failures[0]
     assert mesh.read_bytes() == b"mended by hand" and note.read_text() == "mine"
-
-
-def test_template_that_cannot_serve(scans, template, tmp_path):
-    two = Mesh(np.vstack([template.vertices, template.vertices + 5]), np.vstack([template.faces, template.faces + 642]))
-    with pytest.raises(ValueError, match="2 components"):
-        prepare(find_scans(scans), two, MARKS, tmp_path / "set", QUICK)
-    assert not (tmp_path / "set").exists()
 
 
 @pytest.mark.slow
