@@ -54,10 +54,6 @@ class Called:
     flag: str
 
 
-class _ParseError(Exception):
-    """A value that cannot be converted; the text says what was expected."""
-
-
 @dataclass(frozen=True)
 class Argument:
     """One argument of a command, from its signature and docstring."""
@@ -153,7 +149,7 @@ class Argument:
             if self.parts:
                 return tuple(_value(part, text) for part, text in zip(self.parts, typed, strict=True))
             return typed if self.type is bool else _value(self.type, typed)
-        except _ParseError as wrong:
+        except ValueError as wrong:
             raise UsageError(f"{self.flag}: {wrong}") from None
 
     def check_files(self, value: Any) -> None:
@@ -212,20 +208,20 @@ def _metavar(kind: Any) -> str:
 
 
 def _value(kind: Any, text: str) -> Any:
-    """Convert a text to a type."""
+    """Convert a text to a type; ValueError says what was expected."""
     if allowed := _choices(kind):
         for choice in allowed:
             if str(choice) == text:
                 return choice
-        raise _ParseError(f"expected one of {', '.join(map(str, allowed))}, got {text}{near(text, map(str, allowed))}")
+        raise ValueError(f"expected one of {', '.join(map(str, allowed))}, got {text}{near(text, map(str, allowed))}")
     if kind == int | str:
         if not text.lstrip("-").isdecimal() and "://" not in text:
-            raise _ParseError(f"expected a whole number, or an address such as tcp://host:8786, got {text}")
+            raise ValueError(f"expected a whole number, or an address such as tcp://host:8786, got {text}")
         kind = str if "://" in text else int
     try:
         return kind(text)
     except ValueError:
-        raise _ParseError(f"expected a {'whole ' if kind is int else ''}number, got {text}") from None
+        raise ValueError(f"expected a {'whole ' if kind is int else ''}number, got {text}") from None
 
 
 def near(word: str, known: Iterable[str], alike: float = 0.6) -> str:

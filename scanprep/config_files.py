@@ -12,14 +12,20 @@ import re
 import textwrap
 import types
 import typing
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
 from .geometry import storage
-from .ranges import FLAG, OutOfRangeError, Settings, marks
+from .ranges import FLAG, NO_FLAGS, OutOfRangeError, Settings, marks
 
 Path_ = tuple[str, ...]              # path of a field: parameter, then names of nested settings
+
+# What became of settings of earlier versions: `Class.field`, wherever the class is nested, or the whole name in a file,
+# as `table.field`, where the class is gone too. One sentence each, of what holds now.
+REMOVED: dict[str, str] = {
+    "ScanSettings.pictures": "every scan of a set has its picture on the page",
+}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -49,7 +55,7 @@ def _flags(path: Path_, config: Settings) -> Iterator[Flag]:
         value = getattr(config, field.name)
         if FLAG in marks(hints[field.name]):
             yield Flag((*path, field.name), hints[field.name], value, sentences.get(field.name, ""))
-        elif isinstance(value, Settings):
+        elif isinstance(value, Settings) and NO_FLAGS not in marks(hints[field.name]):
             yield from _flags((*path, field.name), value)
 
 
@@ -148,6 +154,7 @@ def parse_settings(text: str, path: Path, settings: Mapping[str, Settings]) -> d
     if len(in_file) == 1:
         name, config = next(iter(in_file.items()))
         return {**settings, name: _apply_table(config, tree, (), place)}
+    place.check_removed(sorted(tree.keys() - in_file.keys()), ())
     for name in tree:
         place.check_name(name, in_file, (), "table")
     changed = {name: _apply_table(config, tree.get(name, {}), (name,), place) for name, config in in_file.items()}
@@ -172,6 +179,17 @@ class _Place:
             names = f"; did you mean {near[0]}?" if near else f"; there are: {', '.join(known)}"
             raise self.error(name, table, f"expected a {what} of this command{names}")
 
+    def check_removed(self, names: Iterable[str], table: Path_, owner: type | None = None) -> None:
+        """Raise an error for settings of earlier versions: all of a table at once, as each is a line to delete."""
+        classes = () if owner is None else owner.__mro__
+        problems = []
+        for name in names:
+            keys = [".".join((*table, name)), *(f"{base.__name__}.{name}" for base in classes)]
+            problems += [str(self.error(name, table, f"this setting is gone: {REMOVED[key]}"))
+                         for key in keys if key in REMOVED][:1]
+        if problems:
+            raise ValueError("; ".join(problems))
+
     def _line(self, name: str, table: Path_) -> int:
         """Find the line of a key in a table, or of the table itself."""
         at: Path_ = ()
@@ -194,6 +212,7 @@ def _apply_table(config: Settings, tree: Any, table: Path_, place: _Place) -> Se
     if not isinstance(tree, dict):
         raise place.error(table[-1], table[:-1], f"expected a table, got {tree!r}")
     hints, names = _hints(type(config)), [f.name for f in dataclasses.fields(config)]
+    place.check_removed(sorted(tree.keys() - names), table, type(config))
     for name, value in tree.items():
         place.check_name(name, names, table, "setting")
         now = getattr(config, name)

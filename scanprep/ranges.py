@@ -12,6 +12,7 @@ from typing import Annotated, Any, Literal, get_args, get_type_hints
 import numpy as np
 
 FLAG = "flag"                           # marks a field of settings that is also a command-line flag
+NO_FLAGS = "no flags"                   # marks settings inside others: their fields are no flags of that command
 TINY, LARGE = 1e-12, 1e9                # no setting is closer to 0 or larger; squares could overflow
 
 

@@ -1,8 +1,8 @@
 """A hand of a palm and four fingers side by side, whose roots touch their neighbours', with known joints."""
 from __future__ import annotations
 
+import igl
 import numpy as np
-from skimage.measure import marching_cubes
 
 from scanprep.geometry import rotations
 from scanprep.geometry.mesh import Mesh
@@ -20,8 +20,9 @@ def hand() -> Mesh:
     rods = [np.maximum(np.hypot(x - knuckle[0], y) - 0.0085, np.maximum(0.08 - z, z - 0.175)) for knuckle in KNUCKLES]
     webs = np.maximum(np.maximum(abs(x) - 0.036, abs(y) - 0.004), np.maximum(0.08 - z, z - 0.11))
     solid = np.minimum.reduce([palm, webs, *rods])
-    vertices, faces, *_ = marching_cubes(solid, 0.00037, spacing=(STEP,) * 3)
-    mesh = Mesh(vertices + [-0.05, -0.02, -0.01], faces[:, ::-1] if Mesh(vertices, faces).volume < 0 else faces)
+    grid = np.stack([axis.ravel(order="F") for axis in (x, y, z)], axis=1)
+    vertices, faces, _ = igl.marching_cubes(solid.ravel(order="F"), grid, *solid.shape, 0.00037)
+    mesh = Mesh(vertices, faces[:, ::-1] if Mesh(vertices, faces).volume < 0 else faces)
     assert not label_components(*mesh.edges.T, len(mesh.vertices)).any()
     return mesh
 

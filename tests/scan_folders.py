@@ -17,8 +17,7 @@ from scanprep.registration.schedule import RegistrationConfig
 
 MARKS = {"top": 0, "left": 1, "right": 2, "front": 3, "back": 4}
 STAGES = tuple(replace(stage, nodes=40) for stage in RegistrationConfig().graph[4:6])        # the scans lie near
-QUICK = PrepareConfig(ScanSettings(RegistrationConfig(STAGES), pictures=False), min_poses=99, workers=Workers(1))
-WITH_PICTURES = replace(QUICK, scan=replace(QUICK.scan, pictures=True))
+QUICK = PrepareConfig(ScanSettings(RegistrationConfig(STAGES)), min_poses=99, workers=Workers(1))
 
 
 def ball(level=3, radii=(0.3, 0.2, 0.9)):
@@ -48,6 +47,6 @@ if __name__ == "__main__":
     signal.signal(signal.SIGINT, signal.default_int_handler)        # a shell ignores it for what it starts behind
     try:
         prepare(find_scans(sys.argv[1]), ball(), MARKS, Path(sys.argv[2]),
-                replace(WITH_PICTURES, workers=Workers(int(sys.argv[3]))))
+                replace(QUICK, workers=Workers(int(sys.argv[3]))))
     except KeyboardInterrupt:
         sys.exit(130)

@@ -17,7 +17,7 @@ REFERENCES = (ROOT / "README.md").read_text(encoding="utf-8").split("## Referenc
 PAPERS = set(re.findall(r"\[([A-Za-z-]+)\]", REFERENCES))
 WITH_EQUATIONS = {"SCAPE": 11, "Statues": 23, "MoSh": 27}  # the papers at hand, and their last equation
 HEAVY = {"open3d", "pymeshlab", "matplotlib", "PIL", "trimesh", "ezc3d", "igl", "cholespy", "embreex", "pygltflib",
-         "fast_simplification", "rich", "skimage", "sklearn"}
+         "fast_simplification", "rich", "sklearn"}
 ONE_FILE_EACH = {"pymeshlab", "open3d", "ezc3d"}
 SPEAKS = {"cli.py", "command_line.py", "console.py", "interrupts.py", "__main__.py"}
 

@@ -133,15 +133,6 @@ def test_notes_and_failures_name_flags_too(capsys):
     assert "scape work: failed: b.c3d: which of the two? say --times 3\n" in said
 
 
-def test_too_little_memory_is_one_line(capsys):
-    def work() -> Outcome:
-        raise MemoryError
-
-    assert command_line.run(work, "scape work", []) == 1
-    said = capsys.readouterr().err
-    assert said.startswith("scape work: there is too little memory") and said.count("\n") == 1
-
-
 def test_version_and_help_of_a_command(capsys):
     assert main(["--version"]) == 0
     assert re.fullmatch(r"scapekit \d+\.\d+\.\d+\n", capsys.readouterr().out)

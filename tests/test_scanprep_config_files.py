@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 
 import pytest
 from config_files import config_file
-from test_scanprep_ranges import CALLS
+from test_scanprep_ranges import CALLS, SETTINGS
 
 from scanprep import command_line, config_files
 from scanprep.console import Metric, Outcome
@@ -108,15 +108,34 @@ def test_a_flag_wins_over_the_file_and_the_file_over_the_preset(tmp_path, capsys
     ("way = 'up'\n", ":1: way: Invalid enum value 'up'"),
     ("# so\nshare = 1.5\n", ":2: share: expected 0 to 1, got 1.5"),
     ("[inner]\nweight = nan\n", ":2: inner.weight: expected at least 0, got nan"),
+    ("\ncolours = 2\n", ":2: colours: this setting is gone: all are grey"),
+    ("[inner]\nweight = 2\nheight = 1\nwidth = 1\n",
+     ":3: inner.height: this setting is gone: it is 3 mm; {path}:4: inner.width: this setting is gone: use the height"),
     ("inner = 3\n", ":1: inner: expected a table, got 3"),
     ("steps = [1, 'two']\n", ":1: steps: Expected float, got str"),
     ("rounds 3\n", ":1: expected TOML"),
 ])
-def test_what_is_wrong_with_a_file(tmp_path, capsys, text, told):
+def test_what_is_wrong_with_a_file(tmp_path, capsys, monkeypatch, text, told):
+    monkeypatch.setattr(config_files, "REMOVED", {"Outer.colours": "all are grey", "Inner.height": "it is 3 mm",
+                                                  "inner.width": "use the height"})
     path = tmp_path / "my.toml"
     path.write_text(text)
     config, code, said = run(["--config", path], capsys)
-    assert config is None and code == 2 and f"{path}{told}" in said.err and len(said.err.splitlines()) == 1
+    assert config is None and code == 2 and f"{path}{told.format(path=path)}" in said.err
+    assert len(said.err.splitlines()) == 1
+
+
+def test_settings_that_left_are_told_in_one_sentence_each(tmp_path, capsys):
+    """They are not there any more, whether their class is or not; also in a file of a command of several groups."""
+    classes = {cls.__name__: {field.name for field in dataclasses.fields(cls)} for cls in SETTINGS}
+    for key, sentence in config_files.REMOVED.items():
+        owner, _, name = key.rpartition(".")
+        assert name not in classes.get(owner, ()) and 1 < len(sentence.split()) <= 25 and sentence[-1] != "."
+    path = config_file(tmp_path, scan={"pictures": False, "registration": {}})
+    code = command_line.run(CALLS["scape prep run"], "scape prep run", ["scans", "--config", str(path)])
+    assert code == 2 and capsys.readouterr().err == (
+        f"scape prep run: {path}:2: scan.pictures: this setting is gone: every scan of a set has its picture on the "
+        "page\n")
 
 
 def test_a_file_that_is_not_there(tmp_path, capsys):

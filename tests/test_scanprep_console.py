@@ -15,7 +15,6 @@ import pytest
 
 from scanprep import command_line, console
 from scanprep.console import Metric, Outcome
-from scanprep.geometry import storage
 from scanprep.judgement import Judgement
 from scanprep.ranges import FLAG, Settings
 
@@ -65,12 +64,6 @@ def test_wrong_usage(tmp_path):
 def test_help_imports_nothing(capsys):
     assert command_line.dispatch({"work": ("Do it.", "nowhere:work")}, "scape", ["--help"], "lead") == 0
     assert "Do it." in capsys.readouterr().out
-
-
-def test_plain_survives_json():
-    value = {"a": np.float64(1.5), "b": np.arange(3), "c": Choices(), "d": (Path("x"), None)}
-    assert json.loads(json.dumps(storage.as_json(value))) == {
-        "a": 1.5, "b": [0, 1, 2], "c": {"weight": 0.5}, "d": ["x", None]}
 
 
 def test_ctrl_c_before_anything_is_loaded_is_one_line(tmp_path):

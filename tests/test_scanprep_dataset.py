@@ -114,11 +114,6 @@ def test_what_cannot_be_added(full, name, mesh, says):
     assert len(list((full.folder / "meshes").iterdir())) == 5
 
 
-def test_a_skeleton_of_other_triangles_is_refused(full):
-    with pytest.raises(ValueError, match="skeleton: expected 80 faces as the template has, got 2"):
-        full.with_skeleton(Skeleton([0, 1], (-1, 0), np.zeros((2, 3))))
-
-
 def test_unknown_names_and_subjects(full):
     with pytest.raises(ValueError, match=r"names: eve not in .*ann1"):
         full.vertices(["eve"])

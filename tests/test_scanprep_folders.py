@@ -1,30 +1,16 @@
 """Commands that work through many things: the order and the page of what came of them, and what is told of all."""
-from dataclasses import dataclass
 
 import numpy as np
-import pytest
 
-from scanprep.batch.opening import workspace
-from scanprep.batch.pool import Workers
-from scanprep.batch.workspace import Results, Task
+from scanprep.batch.workspace import Results
 from scanprep.console import Metric, judgement_row
-from scanprep.folders import PICTURE, FolderCommand, figure, judgement_on, load_results
+from scanprep.folders import PICTURE, FolderCommand, figure, judgement_on
 from scanprep.judgement import Judgement
 from scanprep.pictures.scene import SCENE
 from scanprep.pictures.sheets import save_png
 
 SHEEP = FolderCommand(("sheep", "sheep"), "{} counted", lambda results, count: [Metric("sheep", count)],
                       lambda rows: figure(rows, "error"), {"count": 1}, hint="Count `again`.")
-
-
-@dataclass(frozen=True)
-class Counting:
-    failing: tuple[str, ...]
-
-    def __call__(self, given, room):
-        if given in self.failing:
-            raise ValueError(f"{given}: no sheep")
-        return rows("good", 1.0)
 
 
 def rows(verdict, error):
@@ -52,16 +38,3 @@ def test_each_has_the_way_to_its_page_and_what_can_be_shown(tmp_path):
     assert "<h1>4 sheep counted</h1>" in html and "<code>again</code>" in html
     assert html.index("f.ply: no sheep") < html.index('href="b/report.html"') and 'href="d%20e/report.html"' in html
     assert html.count("data-scene=") == 1 and 'src="a/picture.png"' in html and "error: 2 mm" in html
-
-
-@pytest.mark.parametrize("failing", [(), ("b",)], ids=["all done", "one failed"])
-def test_a_command_works_through_them(tmp_path, failing):
-    with workspace(tmp_path / "out") as space:
-        outcome = SHEEP.carry_out("counting", space, Counting(failing), [Task(n, n, n) for n in "ab"], Workers(1))
-        again = load_results(space, ["a", "b", "new"])
-    assert outcome.failures == [f"{name}: no sheep" for name in failing]
-    assert outcome.judgement.verdict == ("check" if failing else "good")
-    assert outcome.metrics == [Metric("sheep", 2)] and outcome.settings == {"count": 1}
-    assert set(again.values) == {"a", "b"} - set(failing) and set(again.failures) == set(failing)
-    assert ("no sheep" in (tmp_path / "out" / "report.html").read_text()) == bool(failing)
-

@@ -22,17 +22,6 @@ def test_each_is_the_farthest_from_those_before(start):
     assert farthest_points(points, 12, start).tolist() == by_search(points, 12, first)
 
 
-def test_another_distance_takes_its_place_and_limits_are_true():
-    points = np.random.default_rng(1).normal(size=(40, 3))
-
-    def apart(i, limit):
-        far = np.abs(points - points[i]).sum(axis=1)
-        return np.where(far > limit, np.inf, far)
-
-    whole = farthest_points(points, 9, 0, lambda i, _: apart(i, np.inf))
-    assert farthest_points(points, 9, 0, apart).tolist() == whole.tolist()
-
-
 def test_points_in_one_place_count_once_unless_all_are_wanted():
     points = np.repeat([[0.0, 0, 0], [1, 0, 0], [0, 1, 0]], 4, axis=0)
     assert len(farthest_points(points, 10)) == 3

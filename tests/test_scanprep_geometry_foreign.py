@@ -2,7 +2,6 @@
 import base64
 import json
 import struct
-import warnings
 
 import numpy as np
 import pytest
@@ -76,14 +75,6 @@ def test_a_mark_of_the_encoding_is_no_part_of_the_first_line(tmp_path, name, cod
         assert read_mesh(tmp_path / name).faces.tolist() == [[0, 1, 2]]
 
 
-def test_faces_of_an_off_file_may_go_on_over_lines(tmp_path):
-    rows = "0 0 0\n1 0 0\n0 1 0\n1 1 0\n"
-    (tmp_path / "a.off").write_text(f"OFF\n4 2 0\n{rows}3 0\n1\n2 3\n2 1 3\n")
-    assert read_mesh(tmp_path / "a.off").faces.tolist() == [[0, 1, 2], [2, 1, 3]]
-    (tmp_path / "a.off").write_text(f"OFF\n4 2 0\n{rows}3 0\n1\n2 3\n2 1 3 9\n")
-    refused(tmp_path / "a.off", "expected 2 faces after 4 vertices, found 4 lines")
-
-
 @pytest.mark.parametrize(("name", "text"), [
     ("a.obj", "v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1// 2//\nf\nf 1// 2// 3//\n"),
     ("a.ply", PLY.format("ascii", XYZ, "face", 3, "uchar") + "0 0 0\n1 0 0\n0 1 0\n1 1 0\n2 0 1\n0\n3 0 1 2\n")])
@@ -91,25 +82,6 @@ def test_faces_with_less_than_three_corners_are_left_out(tmp_path, name, text):
     (tmp_path / name).write_text(text)
     with pytest.warns(UserWarning, match="has 2 corners, expected at least 3; 2 such faces were left out"):
         assert read_mesh(tmp_path / name).faces.tolist() == [[0, 1, 2]]
-
-
-def test_a_range_grid_is_joined_where_neighbours_are_near(tmp_path):
-    rows, columns = 6, 8
-    y, x = np.mgrid[:rows, :columns] * 0.01
-    z = np.where(x > 0.035, 0.5, 0.0)                            # a step half a metre deep between columns 3 and 4
-    seen = np.ones((rows, columns), bool)
-    seen[0, 0] = False
-    points = np.stack([x, y, z], axis=2)[seen]
-    number = iter(range(len(points)))
-    cells = "\n".join(f"1 {next(number)}" if there else "0" for there in seen.ravel())
-    header = PLY.format("ascii\nobj_info num_cols 8\nobj_info num_rows 6\ncomment", XYZ, "range_grid", 48, "uchar")
-    header = header.replace("comment 1.0", "").replace("ascii", "ascii 1.0").replace("vertex 4", "vertex 47")
-    rows_of_points = "\n".join(" ".join(f"{v:.9g}" for v in p) for p in points)
-    (tmp_path / "a.ply").write_text(header.replace("\n\n", "\n") + rows_of_points + "\n" + cells + "\n")
-    with pytest.warns(UserWarning, match="range grid of 6 x 8.* 59 triangles, 10 that span jumps"):
-        mesh = read_mesh(tmp_path / "a.ply")
-    assert mesh.vertices.shape == (47, 3)
-    np.testing.assert_allclose(mesh.face_normals, np.tile([0.0, 0, 1], (59, 1)), atol=1e-9)       # towards the scanner
 
 
 @pytest.mark.parametrize("properties", [True, False])
@@ -128,14 +100,6 @@ def test_colours_of_a_ply_are_of_the_scale_that_fits(tmp_path, kind, white):
     rows = "\n".join("{:g} {:g} {:g} {:g} {:g} {:g}".format(*p, *c) for p, c in zip(SQUARE, colors, strict=True))
     (tmp_path / "a.ply").write_text(f"{text}{rows}\n3 0 1 2\n")
     np.testing.assert_allclose(read_mesh(tmp_path / "a.ply").colors, [[1, 0.6, 0.2]] * 4, atol=1e-5)
-
-
-def test_points_that_are_not_finite_are_left_out(tmp_path):
-    text = PLY.format("ascii", XYZ, "face", 1, "uchar") + "0 0 0\nnan nan nan\n1 0 0\n0 1 0\n3 0 2 3\n"
-    (tmp_path / "a.ply").write_text(text)
-    with pytest.warns(UserWarning, match="1 of 4 points are not finite and were left out$"):
-        mesh = read_mesh(tmp_path / "a.ply")
-    assert mesh.faces.tolist() == [[0, 1, 2]] and mesh.of_file.tolist() == [0, -1, 1, 2]
 
 
 # ---- text
@@ -158,18 +122,6 @@ def test_binary_stl_that_begins_with_solid_and_has_bytes_behind(tmp_path):
 def test_an_off_header_glued_to_its_counts(tmp_path):
     (tmp_path / "a.off").write_text("OFF3 1 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1 2\n")
     np.testing.assert_array_equal(read_mesh(tmp_path / "a.off").corners, [SQUARE[:3]])
-
-
-@pytest.mark.parametrize(("color", "right"), [("255 153 51", [1, 0.6, 0.2]), ("1 0.6 0.2", [1, 0.6, 0.2])])
-def test_colours_of_an_obj(tmp_path, color, right):
-    (tmp_path / "a.obj").write_text("".join(f"v {p} {color}\n" for p in ("0 0 0", "1 0 0", "0 1 0")) + "f 1 2 3\n")
-    np.testing.assert_allclose(read_mesh(tmp_path / "a.obj").colors, [right] * 3)
-
-
-def test_one_colour_that_is_no_number_leaves_out_all(tmp_path):
-    (tmp_path / "a.obj").write_text("v 0 0 0 1 nan 1\nv 1 0 0 1 1 1\nv 0 1 0 1 1 1\nf 1 2 3\n")
-    with pytest.warns(UserWarning, match="all colours were left out"):
-        assert read_mesh(tmp_path / "a.obj").colors is None
 
 
 POINTS = [[1.5, 2.5, 3.5], [-1, 0.25, 2e-3]]
@@ -377,11 +329,6 @@ def pictured(folder, picture="lost.png"):
     return folder / "a.obj"
 
 
-def test_a_picture_that_is_missing_is_named(tmp_path):
-    with pytest.warns(UserWarning, match=r"some of its pictures cannot be read.*lost\.png: no such file"):
-        assert read_texture(pictured(tmp_path)) is not None
-
-
 @pytest.mark.parametrize("what", ["folder", "outside", "huge"])
 def test_pictures_that_are_none_or_too_large_are_named(tmp_path, what):
     (tmp_path / "in").mkdir()
@@ -407,12 +354,6 @@ def test_a_picture_in_a_glb_that_cannot_be_read_is_named(tmp_path, picture, says
     else:
         with pytest.raises(ValueError, match=rf"a\.glb.*{says}"):
             read_texture(tmp_path / "a.glb")
-
-
-def test_all_good_pictures_are_read_without_a_word(tmp_path):
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        assert read_texture(pictured(tmp_path, "green.png")).image.max() == pytest.approx(200 / 255, abs=0.01)
 
 
 def test_seams_and_lost_points_together_keep_the_numbers_of_the_file(tmp_path):

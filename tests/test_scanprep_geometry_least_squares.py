@@ -6,7 +6,6 @@ from scipy.sparse import csc_array
 from scanprep.geometry import rotations
 from scanprep.geometry.least_squares import (
     Arrow,
-    Dense,
     Residual,
     Sparse,
     by_rotations,
@@ -35,12 +34,6 @@ def test_a_linear_problem_ends_at_the_least_squares_solution():
     end = levenberg_marquardt(linear(A, b), np.zeros((1, 4)), tolerance=1e-14)
     np.testing.assert_allclose(end.x[0], np.linalg.lstsq(A, b, rcond=None)[0], atol=1e-8)
     assert end.converged.all()
-
-
-def test_a_curved_valley_is_followed_to_its_end():
-    end = levenberg_marquardt(valley, np.array([[-1.2, 1.0], [3.0, -2.0]]), 200, 1e-12)
-    np.testing.assert_allclose(end.x, 1, atol=1e-5)
-    assert (end.energy < 1e-10).all() and end.converged.all()
 
 
 def test_batch_is_the_loop():
@@ -87,22 +80,6 @@ def test_frames_that_share_unknowns_are_solved_as_one_system(damping):
     np.testing.assert_allclose(gain, loss, rtol=1e-6)
 
 
-def test_rows_of_an_arrow_go_on_sharing():
-    A, b = RNG.normal(size=(3, 8, 5)), RNG.normal(size=(3, 8))
-
-    def equations(x):
-        return Arrow(normal_equations([Residual(np.einsum("bmp,bp->bm", A, x) - b, A)]), 2)
-
-    end = levenberg_marquardt(equations, np.zeros((3, 5)), 40)
-    whole = np.zeros((24, 11))
-    for i in range(3):
-        whole[8 * i:8 * i + 8, 3 * i:3 * i + 3], whole[8 * i:8 * i + 8, 9:] = A[i, :, :3], A[i, :, 3:]
-    best = np.linalg.lstsq(whole, b.ravel(), rcond=None)[0]
-    assert end.converged.all()
-    np.testing.assert_allclose(end.x[:, :3].ravel(), best[:9], atol=1e-4)
-    np.testing.assert_allclose(end.x[:, 3:], np.tile(best[9:], (3, 1)), atol=1e-4)
-
-
 def test_rotations_are_found_that_lie_far_away():
     """Wahba's problem, from identity to turns near π, against the solution by singular values."""
     points, R = RNG.normal(size=(5, 12, 3)), rotations.exp(3.1 * rotations.project(RNG.normal(size=(5, 3, 3)))[:, 0])
@@ -118,12 +95,6 @@ def test_rotations_are_found_that_lie_far_away():
     H = np.swapaxes(goal, 1, 2) @ points
     np.testing.assert_allclose(rotations.exp(end.x), rotations.project(H), atol=1e-5)
     assert (np.linalg.norm(end.x, axis=1) <= np.pi + 1e-12).all()
-
-
-def test_a_dense_batch_of_one_is_a_tuple_of_three():
-    energy, gradient, hessian = linear(np.eye(2), np.ones(2))(np.zeros((1, 2)))
-    assert isinstance(linear(np.eye(2), np.ones(2))(np.zeros((1, 2))), Dense)
-    np.testing.assert_allclose((energy[0], gradient[0, 0], hessian[0, 0, 0]), (2, -1, 1))
 
 
 def test_steps_are_rotations_where_derivatives_are_by_rotation_vectors():

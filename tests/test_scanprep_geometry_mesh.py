@@ -57,14 +57,6 @@ def test_edges_and_their_use_against_brute_force(mesh):
 
 
 @every
-def test_neighbouring_triangles_share_exactly_an_edge(mesh):
-    expected = {(i, j) for i in range(len(mesh.faces)) for j in range(i)
-                if len(set(mesh.faces[i]) & set(mesh.faces[j])) == 2}
-    assert {tuple(sorted(p, reverse=True)) for p in mesh.face_pairs.tolist()} == expected
-    assert len(mesh.face_pairs) == len(expected)
-
-
-@every
 def test_normals_and_areas_agree_with_igl(mesh):
     v, f = np.array(mesh.vertices), np.array(mesh.faces)
     np.testing.assert_allclose(mesh.face_areas, igl.doublearea(v, f) / 2)
@@ -90,16 +82,6 @@ def test_volume_of_known_solids_and_its_sign():
     assert Mesh(box.vertices + 5, box.faces).volume == pytest.approx(0.024)
     assert Mesh(box.vertices, box.faces[:, ::-1]).volume == pytest.approx(-0.024)
     assert ball(4).volume == pytest.approx(np.pi / 6, rel=5e-3)
-
-
-def test_border_of_a_sheet_is_one_loop_in_the_direction_of_its_triangles():
-    mesh = grid(5, 4)
-    loop, = mesh.boundary_loops
-    assert len(loop) == 14 and set(loop) == set(mesh.boundary_vertices)
-    half = set(map(tuple, mesh.faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2).tolist()))
-    assert all((a, b) in half for a, b in zip(loop, np.roll(loop, -1), strict=True))
-    x, y = mesh.vertices[loop, :2].T
-    assert np.sum(x * np.roll(y, -1) - y * np.roll(x, -1)) / 2 == pytest.approx(12)       # counter-clockwise
 
 
 @pytest.mark.parametrize("seed", range(5))
@@ -128,18 +110,6 @@ def test_manifold_predicates_agree_with_igl(mesh):
     assert mesh.is_edge_manifold == bool(igl.is_edge_manifold(np.array(mesh.faces))[0])
     assert mesh.is_vertex_manifold == bool(np.all(igl.is_vertex_manifold(np.array(mesh.faces))))
     assert mesh.is_closed == (len(mesh.boundary_loops) == 0)
-
-
-def test_a_fin_and_a_flipped_triangle_are_not_manifold():
-    fin = Mesh([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, 1]], [[0, 1, 2], [1, 0, 3], [0, 1, 4]])
-    flipped = Mesh([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, -1, 0]], [[0, 1, 2], [0, 1, 3]])
-    assert not fin.is_edge_manifold and not flipped.is_edge_manifold and fin.edge_use.max() == 3
-
-
-def test_components_are_numbered_from_the_largest():
-    small, large = ball(0), ball(1)
-    both = Mesh(np.r_[small.vertices, large.vertices + 3, [[9, 9, 9]]], np.r_[small.faces, large.faces + 12])
-    assert both.vertex_component.tolist() == [1] * 12 + [0] * 42 + [2]
 
 
 @every
@@ -200,13 +170,3 @@ def test_what_is_no_template_and_why(mesh, says):
     assert says in (template_problem(mesh) or "")
     with pytest.raises(ValueError, match=f"scan7: not usable as a template, .*{says}"):
         check_template(mesh, "scan7")
-
-
-@every
-def test_manifold_pieces_are_templates(mesh):
-    assert template_problem(mesh) is None or not mesh.is_vertex_manifold
-
-
-def test_vertices_without_triangles_have_no_normal():
-    """Where a file holds points alone; sums over no triangle are whole numbers."""
-    assert not Mesh(np.eye(3), np.zeros((0, 3), dtype=np.int64)).vertex_normals.any()

@@ -45,14 +45,6 @@ def test_pcd_ascii_leaves_out_points_without_return_and_unpacks_colours(tmp_path
     np.testing.assert_array_equal(points.colors, [[1, 0, 0], [0, 0, 1]])
 
 
-def test_text_points_with_a_heading_commas_and_colours(tmp_path):
-    (tmp_path / "a.txt").write_text("//X,Y,Z,R,G,B\n0,0,0,255,0,0\n1,0,0.5,0,51,0\n")
-    points = read_points(tmp_path / "a.txt")
-    np.testing.assert_array_equal(points.points, [[0, 0, 0], [1, 0, 0.5]])
-    np.testing.assert_allclose(points.colors, [[1, 0, 0], [0, 0.2, 0]])
-    assert points.normals is None
-
-
 def test_points_have_units_too(tmp_path):
     write_points(tmp_path / "a.xyz", PointCloud(np.array([[0, 0, 0], [0, 0, 1800.0]])))
     with pytest.warns(UserWarning, match=r"a\.xyz.*unit='mm'"):

@@ -54,24 +54,10 @@ def test_log_near_zero_keeps_its_digits():
         np.testing.assert_allclose(rotations.log(rotations.exp(t)), t, rtol=1e-6, atol=1e-16)
 
 
-def test_leading_dimensions_are_kept():
-    t = np.random.default_rng(0).normal(size=(2, 4, 3))
-    R = rotations.exp(t)
-    assert R.shape == (2, 4, 3, 3)
-    for i in range(2):
-        for j in range(4):
-            np.testing.assert_array_equal(R[i, j], rotations.exp(t[i, j]))
-    np.testing.assert_allclose(rotations.log(R).shape, t.shape)
-
-
 @given(twists(), direction)
 def test_a_rotation_is_active_and_right_handed(t, x):
     np.testing.assert_allclose(rotations.exp(t) @ x, Rotation.from_rotvec(t).apply(x), atol=1e-12)
     np.testing.assert_allclose(rotations.hat(t) @ x, np.cross(t, x), atol=1e-12)
-
-
-def test_a_quarter_turn_about_z_takes_x_to_y():
-    np.testing.assert_allclose(rotations.exp([0, 0, np.pi / 2]) @ [1, 0, 0], [0, 1, 0], atol=1e-15)
 
 
 @given(twists(3.0), direction)
@@ -120,11 +106,6 @@ def test_many_projections_are_those_of_each_alone():
     np.testing.assert_allclose(every, alone, atol=1e-9)
 
 
-def test_mean_of_rotations_about_one_axis_is_the_middle():
-    R = rotations.exp(np.outer([0.1, 0.3, 0.5], [0, 1, 0]))
-    np.testing.assert_allclose(rotations.log(rotations.mean(R)), [0, 0.3, 0], atol=1e-12)
-
-
 @given(twists(), st.integers(3, 20), st.integers(0, 1000))
 def test_procrustes_finds_the_motion_that_was_made(t, n, seed):
     rng = np.random.default_rng(seed)
@@ -145,12 +126,6 @@ def test_procrustes_agrees_with_scipy_with_mirrored_points_too():
         expected = Rotation.align_vectors(target[i] - ct, source[i] - cs)[0].as_matrix()
         np.testing.assert_allclose(R[i], expected, atol=1e-8)
         np.testing.assert_allclose(t[i], ct - expected @ cs, atol=1e-8)
-
-
-def test_arrays_that_are_read_only_will_do():
-    twist = np.broadcast_to([0.1, 0.2, 0.3], (4, 3))
-    R = np.broadcast_to(rotations.exp(twist)[0], (2, 3, 3))
-    np.testing.assert_allclose(rotations.log(R), twist[:2], atol=1e-12)
 
 
 def test_composed_rotation_vectors_are_those_of_the_product():

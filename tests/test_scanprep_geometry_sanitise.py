@@ -5,9 +5,8 @@ import pytest
 from scanned_shapes import ball
 
 from scanprep.cleaning.clean_scan import clean_scan
-from scanprep.geometry.files import read_scan, write_mesh
 from scanprep.geometry.mesh import Mesh, template_problem
-from scanprep.geometry.places import distinct_places, distinct_rows, spacing
+from scanprep.geometry.places import spacing
 from scanprep.geometry.sanitise import _agree_with_camera, invert_triangles, sanitise
 from scanprep.geometry.surface import Rays
 from scanprep.geometry.target import target_of
@@ -124,12 +123,6 @@ def test_every_point_of_a_target_has_a_normal_where_triangles_cancel(person):
         np.testing.assert_allclose(np.linalg.norm(target.normals, axis=1), 1, atol=1e-9)
 
 
-def test_a_file_is_told_by_its_name(tmp_path, person):
-    write_mesh(tmp_path / "a.ply", Mesh(person.vertices, person.faces[:, ::-1]))
-    with pytest.warns(UserWarning, match=r"a\.ply: all triangles faced inward and were turned"):
-        assert read_scan(tmp_path / "a.ply").volume > 0
-
-
 def test_points_that_are_there_twice_are_there_once(person):
     points = person.vertices[::2]
     twice, once = target_of(np.tile(points, (2, 1))), target_of(points)
@@ -139,17 +132,6 @@ def test_points_that_are_there_twice_are_there_once(person):
     rng = np.random.default_rng(0)
     overlapping = np.concatenate([points, points + 1e-6 * rng.normal(size=points.shape)])
     assert spacing(overlapping) == pytest.approx(spacing(points), rel=0.02)
-
-
-def test_rows_that_differ_are_told_apart():
-    rng = np.random.default_rng(0)
-    rows = rng.integers(0, 4, (500, 3)).astype(float)
-    rows[rows == 0] *= rng.choice([-1, 1], (rows == 0).sum())                 # minus zero is zero
-    first = {}
-    expected = [first.setdefault(tuple(row + 0.0), i) for i, row in enumerate(rows)]
-    assert distinct_rows(rows).tolist() == expected
-    assert distinct_places(rows).tolist() == sorted(first.values())
-    assert distinct_rows(np.unique(rows, axis=0)) is None
 
 
 @pytest.mark.parametrize("front", [1, 2, 8])

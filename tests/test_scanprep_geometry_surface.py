@@ -43,20 +43,6 @@ def test_closest_points_against_brute_force():
     assert found.bary.min() > -1e-9
 
 
-def test_a_surface_point_is_carried_with_its_triangle():
-    mesh = ball()
-    found = Surface(mesh).closest(RNG(1).normal(size=(50, 3)))
-    A, t = RNG(2).normal(size=(3, 3)), np.array([1, 2, 3])
-    carried = found.transfer(mesh.vertices @ A.T + t, mesh.faces)
-    np.testing.assert_allclose(carried, found.points @ A.T + t, atol=1e-12)
-
-
-def test_points_on_the_surface_are_at_distance_zero():
-    mesh = ball(2)
-    points, _, _ = mesh.sample(500, RNG(3))
-    assert Surface(mesh).closest(points).distances.max() < 1e-9
-
-
 def test_barycentric_coordinates_come_back_and_flat_triangles_give_their_first_corner():
     corners, bary = RNG(4).normal(size=(200, 3, 3)), RNG(5).dirichlet((1, 1, 1), 200)
     points = np.einsum("nc,ncd->nd", bary, corners)
@@ -113,14 +99,6 @@ def test_rays_hit_a_ball_where_they_should(centre):
     assert np.abs(plane).max() < 1e-5
 
 
-def test_a_ray_reaches_only_so_far():
-    mesh = ball(2)
-    rays, origin, down = Rays(mesh), np.array([[0, 0, 2.0]]), np.array([[0, 0, -1.0]])
-    assert rays.test_occlusion(origin, down, reach=1.6).all() and not rays.test_occlusion(origin, down, reach=1.4).any()
-    assert rays.cast(origin, down)[1][0] == pytest.approx(1.5, abs=1e-5)
-    assert not rays.test_occlusion(origin, -down).any()
-
-
 QUERIES = {
     "closest": lambda bad: Surface(ball()).closest(bad),
     "match": lambda bad: OrientedPoints(ball().vertices, ball().vertex_normals).match(bad, np.zeros((3, 3))),
@@ -153,10 +131,3 @@ def test_without_triangles_nothing_is_nearest_and_nothing_is_hit(vertices):
         warnings.simplefilter("error")
         face, distance = Rays(bare).cast(points, -points)
     assert face.tolist() == [-1] and np.isnan(distance).all()
-
-
-def test_no_points_have_no_answers_and_one_point_is_no_row_of_points():
-    none = np.zeros((0, 3))
-    assert len(Surface(ball()).closest(none).faces) == len(Rays(ball()).cast(none, none)[0]) == 0
-    with pytest.raises(ValueError, match=r"points: expected points of shape \(n, 3\), got shape \(3,\)"):
-        Surface(ball()).closest(np.zeros(3))

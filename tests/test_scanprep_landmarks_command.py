@@ -13,6 +13,7 @@ from scanprep import Mesh, read_landmarks, read_mesh, write_landmarks, write_mes
 from scanprep.batch.opening import workspace
 from scanprep.cli import group
 from scanprep.correspondence.correspondences import Correspondences
+from scanprep.geometry.landmarks import landmarks_beside
 from scanprep.geometry.rotations import exp
 from scanprep.geometry.surface import Surface
 from scanprep.pipeline import landmarks
@@ -27,6 +28,7 @@ from scanprep.pipeline.scans import find_scans
 from scanprep.registration import unmarked
 from scanprep.synthetic.landmarks import landmarks as landmarks_of_people
 from scanprep.synthetic.people import SyntheticPerson
+from scanprep.viewer.clicked import Clicked
 
 NEAR_POSE = dataclasses.replace(QUICK, scan=dataclasses.replace(QUICK.scan, through="pose"))
 CLAWS = {"left claw": 5, "back": 400, "right claw": 800}
@@ -63,7 +65,7 @@ def value(outcome, name):
 
 def test_files_of_three_formats_lie_on_the_scans_and_serve_the_next_command(scans, template, tmp_path):
     output = tmp_path / "points"
-    for format, ending in (("json", ".landmarks.json"), ("pp", ".pp"), ("lnd", ".lnd")):
+    for format, ending in (("json", ".landmarks.json"), ("pp", ".pp"), ("csv", ".landmarks.csv")):
         outcome = write_points(scans, template, output, format)
         assert value(outcome, "registered in this run") == (3 if format == "json" else 0)
         files = sorted(path.name for path in output.glob("body*"))
@@ -74,7 +76,7 @@ def test_files_of_three_formats_lie_on_the_scans_and_serve_the_next_command(scan
             points = np.array(list(read.values()))
             # the scans have the template's vertices, so the truth is known
             assert np.linalg.norm(points - body.vertices[list(MARKS.values())], axis=1).max() < OFF
-            assert Surface(body).closest(points).distances.max() < 1e-5       # .lnd has a thousandth of a millimetre
+            assert Surface(body).closest(points).distances.max() < 1e-5
     rows = rows_of(output)
     assert [(row["scan"], row["landmark"]) for row in rows] == [(f"body{k}", name) for k in range(3) for name in MARKS]
     last = np.array([[float(row[axis]) for axis in "xyz"] for row in rows[-5:]])
@@ -90,19 +92,6 @@ def test_a_scan_that_fails_gets_no_file_and_stops_no_other(scans, template, tmp_
     assert outcome.judgement.verdict == "check" and value(outcome, "scans with landmarks") == "2 of 3"
     assert [path.name[:5] for path in sorted(output.glob("body*"))] == ["body0", "body2"]
     assert {row["scan"] for row in rows_of(output)} == {"body0", "body2"}
-
-
-def test_what_is_done_is_not_done_again(scans, template, tmp_path):
-    output = tmp_path / "points"
-    with workspace(output) as space:
-        write_all(find_scans(scans)[1:], template, MARKS, NEAR_POSE, "json", space)
-    written = {path: path.stat().st_mtime_ns for path in output.rglob("body*") if path.is_file()}
-    outcome = write_points(scans, template, output)
-    assert value(outcome, "registered in this run") == 1 and len(rows_of(output)) == 15
-    assert written and all(path.stat().st_mtime_ns == time for path, time in written.items())
-    before = {path: path.stat().st_mtime_ns for path in output.glob("body*")}
-    assert value(write_points(scans, template, output), "registered in this run") == 0
-    assert {path: path.stat().st_mtime_ns for path in output.glob("body*")} == before
 
 
 def test_what_has_no_data_is_guessed_and_stays_out_of_the_files(scans, template, tmp_path):
@@ -215,3 +204,19 @@ def test_where_all_scans_fail_nothing_is_written(crab_files, tmp_path, capsys):
     assert command(tmp_path, "--unit", "m") == 1
     assert "times as large as the body: the wrong unit? (--unit)" in capsys.readouterr().err
     assert not (tmp_path / "points").exists()
+
+
+@pytest.mark.parametrize("ending", [".lnd", ".landmarks.txt"])
+def test_beside_a_file_that_is_only_read_the_clicks_are_saved_in_a_new_one(scans, ending):
+    """The new file is the one that is read from then on, and the old one stays as it is."""
+    (scans / "body0.landmarks.json").unlink()
+    old = scans / f"body0{ending}"
+    old.write_text("0.1 0.2 0.3 nose\n" if ending.endswith("txt") else "1 0 0 224 100 200 300 nose\n")
+    for format_ending in (".landmarks.csv", ".landmarks.json"):
+        clicked, before = Clicked.load(scans / "body0.ply", format_ending), old.read_bytes()
+        assert np.allclose(clicked.places["nose"], [0.1, 0.2, 0.3])
+        clicked.places["chin"] = np.zeros(3)
+        clicked.save()
+        assert landmarks_beside(scans / "body0.ply") == clicked.file == scans / f"body0{format_ending}"
+        assert [*read_landmarks(clicked.file)] == ["nose", "chin"] and old.read_bytes() == before
+        clicked.file.unlink()

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scan_folders import MARKS, WITH_PICTURES, ball, write_scans
+from scan_folders import MARKS, QUICK, ball, write_scans
 from scene_reader import scenes_of
 from scipy.spatial.transform import Rotation
 
@@ -53,7 +53,7 @@ def folder(tmp_path_factory, template):
         write_landmarks(scans / f"{name}.landmarks.json", {mark: template.vertices[v] for mark, v in MARKS.items()})
     write_points(scans / "body3.xyz", PointCloud(cloud, None, None))
     (scans / "body4.ply").write_text("no mesh <b>")
-    prepare(find_scans(scans), template, MARKS, place / "set", WITH_PICTURES)
+    prepare(find_scans(scans), template, MARKS, place / "set", QUICK)
     return place / "set"
 
 

@@ -5,7 +5,7 @@ import time
 import pytest
 from browser import opened, take_away, wait_until
 from click_app import allowed
-from scan_folders import MARKS, WITH_PICTURES, ball, contents, write_scans
+from scan_folders import MARKS, QUICK, ball, contents, write_scans
 
 from scanprep import RegisteredSet, read_mesh, write_landmarks, write_mesh
 from scanprep.batch.calls import RUN
@@ -35,7 +35,7 @@ def made(tmp_path_factory):
     file = scans / "body1.landmarks.json"
     marks = read_landmarks(file)
     write_landmarks(file, {name: marks[WRONG.get(name, name)] for name in marks})
-    call = Call(scans, place / "template.ply", config=WITH_PICTURES)
+    call = Call(scans, place / "template.ply", config=QUICK)
     with workspace(place / "set") as space:
         carry_out(call, call.inputs(lambda line: None), space)
     return place, shutil.copytree(place, place.with_name("kept"))
@@ -76,7 +76,7 @@ def mend(app, place):
 
 def test_what_a_set_was_made_with_is_read_back(place):
     call = Call.read(place / "set")
-    assert call == Call(place / "scans", place / "template.ply", config=WITH_PICTURES)
+    assert call == Call(place / "scans", place / "template.ply", config=QUICK)
     RegisteredSet.load(place / "set")                      # the set itself is as it was
     (place / "set" / RUN).write_text('{"kind": "call of scape prep run", "version": 2}')
     with pytest.raises(StorageError, match=r"run\.json"):

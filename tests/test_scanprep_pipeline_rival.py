@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from click_app import allowed
-from scan_folders import WITH_PICTURES, ball, contents
+from scan_folders import QUICK, ball, contents
 
 from model.coregistration.lead import ModelLead
 from scanprep import Mesh, RegisteredSet, read_mesh, write_mesh
@@ -41,7 +41,7 @@ def call(tmp_path, monkeypatch):
     for module in (preparing, bootstrap):
         monkeypatch.setattr(module, "lead_of", lambda template, *args: lead)
     monkeypatch.setattr(one_scan, "take_clutter", lambda scan: (scan, 0.0))      # it stays, and leaves a doubt
-    call = Call(tmp_path / "scans", tmp_path / "template.ply", config=WITH_PICTURES)
+    call = Call(tmp_path / "scans", tmp_path / "template.ply", config=QUICK)
     run(call, tmp_path / "set")
     return call
 

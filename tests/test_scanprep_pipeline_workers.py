@@ -9,7 +9,7 @@ import time
 from pathlib import Path
 
 import pytest
-from scan_folders import MARKS, QUICK, WITH_PICTURES, contents, write_scans
+from scan_folders import MARKS, QUICK, contents, write_scans
 from test_scanprep_pipeline import ball_template, three_scans  # noqa: F401 -- fixtures
 
 from scanprep.batch import cluster
@@ -26,7 +26,7 @@ def six(tmp_path_factory, template):
     place = tmp_path_factory.mktemp("six")
     scans = write_scans(place / "scans", template, 6)
     (scans / "body3.ply").write_bytes((scans / "body3.ply").read_bytes()[:-50])
-    done = prepare(find_scans(scans), template, MARKS, place / "one" / "set", WITH_PICTURES)
+    done = prepare(find_scans(scans), template, MARKS, place / "one" / "set", QUICK)
     assert len(done.figures) == 5 and len(done.failures) == 1
     return scans, place / "one" / "set"
 
@@ -48,7 +48,7 @@ def test_killed_in_the_middle_and_started_again(six, template, tmp_path, sign):
     if sign == signal.SIGINT:
         assert 'id="scan-' in (tmp_path / "set" / "report.html").read_text()
     stamps = {name: (tmp_path / "set" / "meshes" / f"{name}.ply").stat().st_mtime_ns for name in done}
-    again = prepare(find_scans(scans), template, MARKS, tmp_path / "set", WITH_PICTURES)
+    again = prepare(find_scans(scans), template, MARKS, tmp_path / "set", QUICK)
     assert again.fresh == 5 - len(done)
     assert {name: (tmp_path / "set" / "meshes" / f"{name}.ply").stat().st_mtime_ns for name in done} == stamps
     assert contents(tmp_path / "set") == contents(whole)
@@ -59,15 +59,6 @@ def finished(folder):
 
 
 @pytest.mark.slow
-def test_processes_change_nothing(six, template, tmp_path):
-    scans, whole = six
-    two = dataclasses.replace(WITH_PICTURES, workers=Workers(2))
-    done = prepare(find_scans(scans), template, MARKS, tmp_path / "set", two)
-    assert "body3.ply" in done.failures[0]
-    assert contents(tmp_path / "set") == contents(whole)
-
-
-@pytest.mark.slow
 @pytest.mark.parametrize("processes, seen", [(True, True), (False, False)])
 def test_a_cluster_changes_nothing(six, template, tmp_path, processes, seen, monkeypatch):
     """Nor one whose workers do not see the files, which then travel along."""
@@ -75,48 +66,11 @@ def test_a_cluster_changes_nothing(six, template, tmp_path, processes, seen, mon
     scans, whole = six
     layout = {"n_workers": 2, "threads_per_worker": 1} if processes else {"n_workers": 1, "threads_per_worker": 3}
     with distributed.LocalCluster(processes=processes, dashboard_address=None, **layout) as local:
-        with distributed.Client(local, set_as_default=False) as client:
-            here = [task.scan for task in find_scans(scans)]
-            assert cluster._has_same_files(client, here) and cluster._has_same_files(client, [tmp_path / "none"])
-            monkeypatch.setattr(Path, "absolute", lambda path: Path("/elsewhere") / path.name)
-            assert not cluster._has_same_files(client, here)
-            monkeypatch.undo()
         if not seen:
             monkeypatch.setattr(cluster, "_has_same_files", lambda client, given: False)
-        config = dataclasses.replace(WITH_PICTURES, workers=Workers(local.scheduler_address))
+        config = dataclasses.replace(QUICK, workers=Workers(local.scheduler_address))
         prepare(find_scans(scans), template, MARKS, tmp_path / "set", config)
     assert contents(tmp_path / "set") == contents(whole)
-
-
-def test_shipped_files_need_no_folder(scans, template):
-    task, shared = find_scans(scans)[0], pickle.dumps((RegisterScan(template, MARKS, QUICK.scan), cluster._versions()))
-    there = dataclasses.replace(task, scan=Path("/no/such/body0.ply"), landmarks=Path("/no/such/body0.landmarks.json"))
-    files = {there.scan: task.scan.read_bytes(), there.landmarks: task.landmarks.read_bytes()}
-    assert cluster._files(task) == {task.scan: files[there.scan], task.landmarks: files[there.landmarks]}
-    figures, made, _ = cluster.do_there(shared, pickle.dumps(("scans/body0", "", there, files)))
-    assert figures.name == "body0" and set(made) == {"meshes/body0.ply"} and figures.distance < 0.001
-    files[there.scan] = files[there.scan][:-9]
-    failed, made, _ = cluster.do_there(shared, pickle.dumps(("scans/body0", "", there, files)))
-    assert failed.reason.startswith("/no/such/body0.ply: ") and not made
-
-
-class Noticing:
-    """Work that says something of its file."""
-
-    def __call__(self, given, room):
-        (room.folder / "made.txt").write_text("")
-        warn_of(f"{given}: its rate is 0")
-
-
-def warn_of(text):
-    exec(compile("import warnings; warnings.warn(text, stacklevel=1)", "tried", "exec"),
-         {"__name__": "scanprep.tried", "text": text})
-
-
-def test_what_a_worker_noticed_is_told_here_with_our_paths(tmp_path):
-    path = Path("/no/such/walk.c3d")
-    shared, job = pickle.dumps((Noticing(), cluster._versions())), ("walk", "", path, {path: b"data"})
-    assert cluster.do_there(shared, pickle.dumps(job)) == (None, {"made.txt": b""}, [f"{path}: its rate is 0"])
 
 
 def test_no_scheduler(scans, template, tmp_path, monkeypatch):
@@ -138,16 +92,6 @@ def test_workers_of_another_version(scans, template):
     shared = pickle.dumps((RegisterScan(template, MARKS, QUICK.scan), {"scapekit": "0.0.0", "numpy": "1"}))
     with pytest.raises(RuntimeError, match=r"the worker has scapekit .*sources [0-9a-f]{12} and numpy"):
         cluster.do_there(shared, pickle.dumps(("body0", "", find_scans(scans)[0], None)))
-
-
-def test_a_scheduler_needs_nothing_of_ours():
-    """It unpacks the function and its arguments; ours would have to be installed there too."""
-    import cloudpickle
-
-    code = f"import pickle, sys\npickle.loads({cloudpickle.dumps(cluster._entrance())!r})\nassert not any(" \
-           "name.split('.')[0] == 'scanprep' for name in sys.modules)"
-    done = subprocess.run([sys.executable, "-c", code], cwd="/", capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr
 
 
 @dataclasses.dataclass(frozen=True)

@@ -2,7 +2,6 @@
 import os
 import subprocess
 import sys
-import threading
 
 import numpy as np
 import pytest
@@ -43,47 +42,6 @@ def test_one_thread_while_anyone_needs_it():
     with pytest.raises(ZeroDivisionError), one_thread():
         raise ZeroDivisionError
     assert pools() == {2}
-
-
-def test_users_side_by_side_share_one_limit():
-    inside, leave, seen = threading.Barrier(3), threading.Event(), []
-
-    def work():
-        with one_thread():
-            inside.wait()
-            leave.wait()
-        seen.append(pools())
-
-    others = [threading.Thread(target=work, daemon=True) for _ in range(2)]
-    for other in others:
-        other.start()
-    inside.wait()
-    with one_thread():
-        pass
-    assert pools() == {1}                                            # the others are still at work
-    leave.set()
-    for other in others:
-        other.join()
-    assert pools() == {2} and len(seen) == 2
-
-
-@pytest.mark.parametrize("name", VARIABLES)
-def test_the_number_of_the_user_wins(monkeypatch, name):
-    monkeypatch.setenv(name, "2")
-    with one_thread():
-        assert pools() == {2}
-    assert search_threads(10**6) == 2
-    monkeypatch.setenv(name, "3,1")
-    assert threads.threads_asked() == 3
-    monkeypatch.setenv(name, "many")
-    assert threads.threads_asked() == 1
-    monkeypatch.setenv(name, "")
-    assert threads.threads_asked() is None
-
-
-def test_a_search_takes_the_cores_for_many_points_only(monkeypatch):
-    monkeypatch.setattr(threads, "_cores", lambda: 5)
-    assert search_threads(100) == 1 and search_threads(10**5) == 5
 
 
 def test_a_command_has_one_thread_and_leaves_the_settings_as_they_were(monkeypatch):

@@ -116,7 +116,7 @@ def test_lists_of_names_come_from_a_file(tmp_path):
             read_names(str(wrong))
 
 
-@pytest.mark.parametrize("ending", [".landmarks.json", ".pp", ".mrk.json", ".fcsv", ".landmarks.csv"])
+@pytest.mark.parametrize("ending", [".landmarks.json", ".landmarks.csv", ".pp", ".mrk.json"])
 def test_every_click_is_saved_in_the_format_wanted(folder, person, ending):
     app, file = app_of(folder, ending=ending), None
     for name in FOUR[:2]:

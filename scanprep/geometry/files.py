@@ -65,25 +65,21 @@ def name_of(path: str | Path) -> str:
     return _ENDING.sub("", name) or name
 
 
-class _Format(NamedTuple):
-    """How one file format is read and written."""
+# readers and writers by ending: a new format needs a module and a line here; points never have triangles
+_MESH_READERS: dict[str, Callable[[Path, bytes], Contents]] = {
+    ".ply": format_ply.read, ".obj": format_text.read_obj, ".stl": format_stl.read, ".off": format_text.read_off,
+    ".glb": format_glb.read, ".gltf": format_glb.read_gltf}
+_READERS = {**_MESH_READERS, ".pcd": format_pcd.read,
+            **dict.fromkeys((".xyz", ".pts", ".txt", ".asc", ".csv"), format_text.read_xyz)}
+_Encode = Callable[[Contents, bool], bytes]                         # (contents, double precision)
+_MESH_WRITERS: dict[str, _Encode] = {
+    ".ply": format_ply.encode, ".obj": format_text.encode_obj, ".stl": format_stl.encode,
+    ".off": format_text.encode_off, ".glb": format_glb.encode}
+_POINT_WRITERS: dict[str, _Encode] = {
+    ".ply": format_ply.encode, ".pcd": format_pcd.encode,
+    **dict.fromkeys((".xyz", ".pts", ".txt"), format_text.encode_xyz)}
 
-    read: Callable[[Path, bytes], Contents]
-    encode: Callable[[Contents, bool], bytes] | None = None     # (contents, double precision)
-
-
-# readers by ending: a new format needs a module and a line here; `_MESHES` may hold triangles, `_POINTS` never do
-_ROWS = _Format(format_text.read_xyz, format_text.encode_xyz)
-_MESHES = {".ply": _Format(format_ply.read, format_ply.encode),
-           ".obj": _Format(format_text.read_obj, format_text.encode_obj),
-           ".stl": _Format(format_stl.read, format_stl.encode),
-           ".off": _Format(format_text.read_off, format_text.encode_off),
-           ".glb": _Format(format_glb.read, format_glb.encode), ".gltf": _Format(format_glb.read_gltf)}
-_POINTS = {".pcd": _Format(format_pcd.read, format_pcd.encode), ".xyz": _ROWS, ".pts": _ROWS, ".txt": _ROWS,
-           ".asc": _Format(format_text.read_xyz), ".csv": _Format(format_text.read_xyz)}
-_FORMATS = {**_MESHES, **_POINTS}
-
-ENDINGS = tuple(_FORMATS)
+ENDINGS = tuple(_READERS)
 # formats that are not read, with the export of a program that reads them
 _EXPORTS = {**dict.fromkeys((".fbx", ".blend", ".usd", ".usda", ".usdc", ".usdz"),
                             "Blender (File > Open or Import, then Export) makes GLB of it"),
@@ -203,7 +199,7 @@ def write_mesh(path: str | Path, mesh: Mesh, precision: Precision = "double") ->
     True
     """
     mesh = mesh if mesh.attached is None else mesh.attached.mesh(mesh)
-    _write(Path(path), Contents(mesh.vertices, mesh.faces, None, mesh.colors, up=mesh.up), precision, _MESHES)
+    _write(Path(path), Contents(mesh.vertices, mesh.faces, None, mesh.colors, up=mesh.up), precision, _MESH_WRITERS)
 
 
 @dataclass(frozen=True, eq=False)
@@ -304,7 +300,7 @@ def common_unit(paths: Sequence[Path], unit: str | None = None) -> str | None:
 def write_points(path: str | Path, cloud: PointCloud) -> None:
     """Write points in metres, atomically: `.ply`, `.ply.gz`, `.pcd`, `.xyz`, `.txt` or `.pts`."""
     contents = Contents(cloud.points, None, cloud.normals, cloud.colors)
-    _write(Path(path), contents, "double", {".ply": _MESHES[".ply"], **_POINTS})
+    _write(Path(path), contents, "double", _POINT_WRITERS)
 
 
 def advice(path: Path) -> str:
@@ -320,7 +316,7 @@ def is_scan(path: Path) -> bool:
 def list_meshes(folder: str | Path) -> list[Path]:
     """List the mesh files of a folder or RegisteredSet, sorted by name; MeshFileError if there is none."""
     inside = Path(folder) / "meshes" if (Path(folder) / "set.json").is_file() else Path(folder)
-    return list_files(inside, lambda path: ending_of(path) in _MESHES, f"meshes ({', '.join(_MESHES)})")
+    return list_files(inside, lambda path: ending_of(path) in _MESH_READERS, f"meshes ({', '.join(_MESH_READERS)})")
 
 
 def list_files(folder: Path, wanted: Callable[[Path], bool], least_one_of: str = "") -> list[Path]:
@@ -377,11 +373,11 @@ def _read(path: Path) -> Contents:
     """Read a file of any format, without values that are not finite."""
     storage.check_regular(path, MeshFileError)
     ending = ending_of(path)
-    if ending not in _FORMATS:           # checked before the contents, which may be empty
+    if ending not in _READERS:           # checked before the contents, which may be empty
         raise MeshFileError(f"{path}: expected a name ending in {', '.join(ENDINGS)}, found {ending or 'none'!r}"
                             + (advice(path) and f"; {advice(path)}"))
     with reading(path, MeshFileError):
-        contents = _FORMATS[ending].read(path, load_bytes(path))
+        contents = _READERS[ending](path, load_bytes(path))
     if not len(contents.vertices):
         raise EmptyFileError(f"{path}: the file holds no vertices")
     contents = _finite(path, contents)
@@ -411,11 +407,10 @@ def _finite(path: Path, contents: Contents) -> Contents:
                    of_file=of_file)
 
 
-def _write(path: Path, contents: Contents, precision: Precision, formats: dict[str, _Format]) -> None:
+def _write(path: Path, contents: Contents, precision: Precision, writers: dict[str, _Encode]) -> None:
     """Write a file in the format of its ending, packed if it ends in `.gz`."""
     if precision not in ("double", "single"):
         raise ValueError(f"precision: expected 'double' or 'single', got {precision!r}")
-    writers = {ending: one.encode for ending, one in formats.items() if one.encode is not None}
     if ending_of(path) not in writers:
         raise MeshFileError(f"{path}: expected a name ending in {', '.join(writers)}, "
                             f"found {ending_of(path) or 'none'!r}")

@@ -423,11 +423,6 @@ class Glb:
         """Add the corners of triangles; return the index of the accessor."""
         return self._append(np.ascontiguousarray(faces, dtype="<u4"), faces.size, "SCALAR", _INDICES, {})
 
-    def add_raw(self, values: np.ndarray, kind: str, normalized: bool) -> int:
-        """Add numbers of any type; return the index of the accessor."""
-        values = np.ascontiguousarray(values, dtype=values.dtype.newbyteorder("<"))
-        return self._append(values, len(values), kind, None, {"normalized": normalized})
-
     def add_surface(self, mesh: Mesh, normals: np.ndarray | None = None, uv: np.ndarray | None = None,
                     targets: Iterable[np.ndarray] = ()) -> dict[str, Any]:
         """Add a surface with its colours and the first material; return a primitive of `meshes`.

@@ -127,8 +127,6 @@ def read_off(path: Path, data: bytes) -> Contents:
     if kind[2] and table.shape[1] >= width + 3:
         colors = as_colors(table[:, width:width + 3])
     place += n
-    if place + f < len(lines):
-        _one_face_a_line(lines, place, f)
     if place + f != len(lines):
         found = len(lines) - place
         raise MeshFileError(f"{path}: {'truncated: ' if found < f else ''}expected {f} faces after {n} vertices, "
@@ -137,19 +135,6 @@ def read_off(path: Path, data: bytes) -> Contents:
     sizes, corners = ascii_element(lines, face, place)[0]["corners"]
     faces = polygons(path, sizes, corners, n, lines.numbers[place:place + f], table[:, :3])
     return Contents(table[:, :3], faces, table[:, 3:6] if kind[3] else None, colors)
-
-
-def _one_face_a_line(lines: Lines, place: int, count: int) -> None:
-    """Join lines from `place` on, if faces span several lines and are exactly `count`."""
-    words, faces, at = [word for line in lines.text[place:] for word in line.split()], list[bytes](), 0
-    for _ in range(count):
-        if at >= len(words) or not words[at].isdigit() or len(words[at]) > 9:
-            return
-        stop = at + 1 + int(words[at])
-        faces.append(b" ".join(words[at:stop]))
-        at = stop
-    if at == len(words):
-        lines.text[place:], lines.numbers = faces, [*lines.numbers[:place], *[lines.numbers[place]] * count]
 
 
 def encode_off(contents: Contents, double: bool) -> bytes:

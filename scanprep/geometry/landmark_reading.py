@@ -1,4 +1,4 @@
-"""Read landmark files of other programs; `landmark_writing` is the counterpart."""
+"""Read landmark files of other programs; `landmark_writing` writes some of them."""
 from __future__ import annotations
 
 import csv

@@ -1,9 +1,10 @@
-"""Write landmark files of other programs; the counterpart of `landmark_reading`."""
+"""Write landmark files of other programs; `landmark_reading` reads more of them."""
 from __future__ import annotations
 
 import json
 import re
 from collections.abc import Callable, Mapping
+from pathlib import Path
 from typing import Literal
 from xml.sax.saxutils import escape, quoteattr
 
@@ -14,7 +15,7 @@ from .format_common import UNITS
 from .tables import csv_text
 
 Points = Mapping[str, np.ndarray]
-Format = Literal["json", "pp", "mrk.json", "fcsv", "scalismo.json", "csv", "lnd", "txt"]
+Format = Literal["json", "csv", "pp", "mrk.json"]
 
 
 CLICKED_JOINTS = ".features.json"    # ending of the joints clicked in a scan; no command takes them for its landmarks
@@ -28,23 +29,32 @@ def landmark_ending(format: Format) -> str:
     >>> landmark_ending("pp"), landmark_ending("json")
     ('.pp', '.landmarks.json')
     """
-    return (".landmarks." if format in ("json", "csv", "txt") else ".") + format
+    return (".landmarks." if format in ("json", "csv") else ".") + format
 
 
-def encode_landmarks(name: str, points: Points, unit: str | None) -> bytes | None:
+def is_written(file: Path) -> bool:
+    """Return whether landmarks can be written in the format of a file name; others are only read.
+
+    Examples
+    --------
+    >>> is_written(Path("anna.pp")), is_written(Path("anna.lnd"))
+    (True, False)
+    """
+    name = file.name.lower()
+    return name.endswith((".json", *_WRITERS)) and not name.endswith(".scalismo.json")
+
+
+def encode_landmarks(file: Path, points: Points, unit: str | None) -> bytes | None:
     """Encode points (3,), metres, in the format of a file name; None for our JSON.
 
     `unit` is that of the coordinates in the file, by default the one that `read_landmarks` expects. ValueError for a
-    landmark name that the format cannot hold.
+    format that is not written, or a landmark name that it cannot hold.
     """
-    ending = next((ending for ending in _WRITERS if name.lower().endswith(ending)), None)
-    if ending is None:
-        return None
-    try:
-        return _WRITERS[ending](points, unit).encode("latin-1" if ending == ".lnd" else "utf-8")
-    except UnicodeEncodeError as error:
-        raise ValueError(f"landmarks: a name has {error.object[error.start]!a}, which {ending} cannot hold; write JSON"
-                         ) from None
+    if not is_written(file):
+        raise ValueError(f"{file}: expected a name ending in .json, {', '.join(_WRITERS)}; landmarks are written as "
+                         "JSON, CSV, and for MeshLab and 3D Slicer")
+    writer = next((_WRITERS[ending] for ending in _WRITERS if file.name.lower().endswith(ending)), None)
+    return None if writer is None else writer(points, unit).encode("utf-8")
 
 
 def _meshlab(points: Points, unit: str | None) -> str:
@@ -62,28 +72,9 @@ def _slicer(points: Points, unit: str | None) -> str:
                                     "controlPoints": controls}]}, indent=1)
 
 
-def _fiducials(points: Points, unit: str | None) -> str:
-    """Encode an .fcsv file of 3D Slicer, in its LPS frame."""
-    columns = "id,x,y,z,ow,ox,oy,oz,vis,sel,lock,label,desc,associatedNodeID"
-    rows = [(i + 1, *point, 0, 0, 0, 1, 1, 1, 0, name, "", "")
-            for i, (name, point) in enumerate(_as_text(points, unit or "mm"))]
-    return f"# Markups fiducial file version = 4.11\n# CoordinateSystem = LPS\n# columns = {columns}\n{csv_text(rows)}"
-
-
-def _scalismo(points: Points, unit: str | None) -> str:
-    """Encode JSON of scalismo."""
-    return json.dumps([{"id": name, "coordinates": point.tolist()} for name, point in _in_unit(points, unit or "m")],
-                      indent=1)
-
-
 def _table(points: Points, unit: str | None) -> str:
     """Encode a CSV table."""
     return csv_text([("name", "x", "y", "z"), *((name, *point) for name, point in _as_text(points, unit or "m"))])
-
-
-def _marker_set(points: Points, unit: str | None) -> str:
-    """Encode a marker set of OpenSim 4, all in the frame of the ground."""
-    return marker_set({name: ("/ground", point) for name, point in _as_xml(points, unit or "m")})
 
 
 def marker_set(markers: Mapping[str, tuple[str, np.ndarray]]) -> str:
@@ -121,31 +112,10 @@ def _as_text(points: Points, unit: str) -> list[tuple[str, list[str]]]:
     return [(name, [repr(float(value)) for value in point]) for name, point in _in_unit(points, unit)]
 
 
-def _caesar(points: Points, unit: str | None) -> str:
-    """Encode CAESAR's .lnd: number, two codes, distance from the axis, x, y, z, name."""
-    rows = [f"{i + 1} 0 0 {np.hypot(x, y):.6f} {x:.6f} {y:.6f} {z:.6f} {_one_line(name)}"
-            for i, (name, (x, y, z)) in enumerate(_in_unit(points, unit or "mm"))]
-    return "AUX =\n" + "\n".join(rows) + "\nEND =\n"
-
-
-def _rows(points: Points, unit: str | None) -> str:
-    """Encode lines of x, y, z and name."""
-    return "".join(f"{x:.12g} {y:.12g} {z:.12g} {_one_line(name)}\n"
-                   for name, (x, y, z) in _in_unit(points, unit or "m"))
-
-
 def _in_unit(points: Points, unit: str) -> list[tuple[str, np.ndarray]]:
     """Convert points from metres to a unit."""
     return [(name, np.asarray(point, dtype=float) / UNITS[unit]) for name, point in points.items()]
 
 
-def _one_line(name: str) -> str:
-    """Check that a name fits into a line; ValueError if not."""
-    if name != " ".join(name.split()) or "=" in name or name.startswith("#"):
-        raise ValueError(f"landmarks: '{name}' cannot be the name of a landmark in a file of lines; write JSON")
-    return name
-
-
 _WRITERS: dict[str, Callable[[Points, str | None], str]] = {
-    ".mrk.json": _slicer, ".fcsv": _fiducials, ".scalismo.json": _scalismo, ".csv": _table, ".xml": _marker_set,
-    ".pp": _meshlab, ".lnd": _caesar, ".txt": _rows}
+    ".csv": _table, ".pp": _meshlab, ".mrk.json": _slicer}

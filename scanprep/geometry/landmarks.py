@@ -19,8 +19,9 @@ from .landmark_writing import encode_landmarks
 from .mesh import Mesh, take_any_mesh
 from .surface import Surface
 
-LANDMARK_ENDINGS = (".landmarks.json", ".json", ".mrk.json", ".pp", "_picked_points.pp", ".lnd", ".landmarks.txt",
-                    ".landmarks.csv", ".fcsv", ".scalismo.json")
+# those that are written come first: what was clicked on top of a file that is only read lies beside it
+LANDMARK_ENDINGS = (".landmarks.json", ".json", ".mrk.json", ".pp", "_picked_points.pp", ".landmarks.csv", ".lnd",
+                    ".landmarks.txt", ".fcsv", ".scalismo.json")
 
 
 @take_any_mesh
@@ -168,17 +169,17 @@ def write_landmarks(path: str | Path, landmarks: Mapping[str, np.ndarray | int |
     Parameters
     ----------
     path : str or Path
-        The ending determines the format, as for `read_landmarks`; an unknown ending means JSON.
+        The ending determines the format: `.json`, `.csv`, MeshLab `.pp`, or 3D Slicer `.mrk.json`.
     landmarks : dict of str to (3,) float, metres, or int, or {"face": f, "bary": [a, b, c]}
         Points, vertices, or points of faces; the last two in JSON only.
     unit : 'm', 'mm', 'cm' or 'in', optional
-        Unit of the coordinates in the file, to be given to `read_landmarks` again. By default metres; in `.lnd`,
-        `.fcsv` and `.mrk.json` millimetres.
+        Unit of the coordinates in the file, to be given to `read_landmarks` again. By default metres; in `.mrk.json`
+        millimetres.
 
     Raises
     ------
     ValueError
-        A point that is not finite, or that the format cannot hold.
+        A format that is not written, or a point that is not finite or that the format cannot hold.
 
     Examples
     --------
@@ -198,7 +199,7 @@ def write_landmarks(path: str | Path, landmarks: Mapping[str, np.ndarray | int |
         out[name] = point
     # formats of other programs hold points only; JSON of ours holds vertices and points of faces too
     points = {name: value for name, value in out.items() if isinstance(value, np.ndarray)}
-    data = encode_landmarks(Path(path).name, points, unit)
+    data = encode_landmarks(Path(path), points, unit)
     if data is None:
         storage.write_json(path, {name: (value / metres_of(unit)).tolist() if name in points else value
                                   for name, value in out.items()})

@@ -38,29 +38,25 @@ MODEL = "set_model.npz"             # file of the learned model, in the folder o
 
 
 @dataclass(frozen=True, eq=False)
-class DoubtedScan:
-    """A scan to register again, and its badness: how many times over a limit; infinite where it failed."""
-
-    scan: ScanTask
-    badness: float
-
-
-@dataclass(frozen=True, eq=False)
 class RegisterAgain:
     """The work on each doubted scan: register it through the set's model, and write it if clearly better."""
 
     first: RegisterScan
     number: int                     # of the round, from 1
 
-    def __call__(self, doubted: DoubtedScan, context: TaskContext) -> ScanFigures | None:
-        """Register a scan again; return its figures, or None where it is not clearly better."""
+    def __call__(self, doubted: tuple[ScanTask, float], context: TaskContext) -> ScanFigures | None:
+        """Register a scan again; return its figures, or None where it is not clearly better.
+
+        With it comes its badness: how many times it was over a limit, infinite where it failed.
+        """
+        scan, badness = doubted
         try:
-            registered = self.first.register(doubted.scan, context)
+            registered = self.first.register(scan, context)
         except ValueError:              # the model fails too: the first registration, or its failure, stays
             return None
-        if not judge_alone(registered.figures, self.first).badness < CLEARLY * doubted.badness:
+        if not judge_alone(registered.figures, self.first).badness < CLEARLY * badness:
             return None
-        self.first.write(context.folder / folder_of(self.number), doubted.scan.name, registered)
+        self.first.write(context.folder / folder_of(self.number), scan.name, registered)
         return registered.figures
 
 
@@ -167,9 +163,9 @@ def bootstrap_set(space: Workspace, work: RegisterScan, tasks: Sequence[ScanTask
         assert lead is not None, "a model was named"
         again = RegisterAgain(replace(work, lead=replace(lead, name=lead_name)), number)      # type: ignore[type-var]
         # register the doubted scans through it
-        inputs = [DoubtedScan(replace(task, model=model), best[task.name].badness if task.name in best else np.inf)
-                  for task in doubted]
-        done = space.run(again, [Task(prefix + one.scan.name, one) for one in inputs], workers, progress)
+        jobs = [Task(prefix + task.name, (replace(task, model=model), best[task.name].badness if task.name in best
+                                          else np.inf)) for task in doubted]
+        done = space.run(again, jobs, workers, progress)
         drop_round(space, number, {task.name for task in tasks} - {task.name for task in doubted})
         fresh |= {name.removeprefix(prefix) for name in done.fresh}
         # better registrations replace the earlier ones in the rounds to come

@@ -96,8 +96,7 @@ def landmark_scans(scans: ScansArg, output: Output, template: Path | None = None
         output: Folder of the landmark files, which scape prep run takes as --landmarks.
         template: Mesh whose landmarks are wanted, in the file of its name beside it. A person gets the built-in
             landmarks that are not in that file, too; without a template it is the built-in people's average body.
-        format: Of the landmark files: json, pp (MeshLab), mrk.json and fcsv (3D Slicer), scalismo.json, csv,
-            lnd (CAESAR), txt.
+        format: Of the landmark files: json, csv, pp (MeshLab), mrk.json (3D Slicer).
         unit: Unit of the scans, and of the landmark files; "unknown": it is found together with the person. The table
             is in metres.
         up: The axis of the scans that points up, where it is known.

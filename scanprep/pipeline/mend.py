@@ -60,6 +60,9 @@ class MendApp(ResultsApp):
         worst = [name for name in results if name in self.tasks]
         self.scan_names = [*worst, *(name for name in self.tasks if name not in results)]
         template = Clicked.load(self.call.template, ending, None, self.call.template_landmarks)
+        if self.call.template_landmarks not in (None, template.file):
+            raise ValueError(f"{self.call.template_landmarks}: landmarks in this format are read, not written; run "
+                             "the command again with them as JSON")
         scans = [self._load_clicked(self.tasks[name], ending) for name in self.scan_names]
         known = any(one.places for one in (template, *scans))
         super().__init__(template, scans, names or (() if known else TEN))

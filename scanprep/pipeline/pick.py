@@ -37,9 +37,8 @@ def pick_landmarks(mesh: MeshArg, scans: ScansArg = (), names: str = "ten", form
         scans: Scans to click the same landmarks on, one after the other, or folders of them.
         names: Names to offer beside those that are there already: "ten" for people, "caesar" for the 73 of CAESAR, or
             a text file with one name in each line.
-        format: Of new landmark files, which are written beside each scan with its name: json, pp (MeshLab),
-            mrk.json and fcsv (3D Slicer), scalismo.json, csv, lnd (CAESAR), txt. A file that is there keeps its format,
-            and a copy of it as it was.
+        format: Of new landmark files, which are written beside each scan with its name: json, csv, pp (MeshLab),
+            mrk.json (3D Slicer). A file of these formats that is there keeps its own, and a copy of it as it was.
         unit: Unit of the scans and of their landmarks; of the mesh, if there are no scans.
         joints: Click joint centres inside one body, for scape statue fit --features. Offers the joints of its generic
             humanoid and points of the face, or --names; written beside the scan as NAME.features.json.

@@ -9,6 +9,7 @@ import shutil
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
 
@@ -21,7 +22,7 @@ from ..geometry.members import ONE_BODY, check_members
 from ..geometry.mesh import Mesh, check_template
 from ..judgement import Judgement
 from ..judgement import size as size_of
-from ..ranges import Count, Settings
+from ..ranges import NO_FLAGS, Count, Settings
 from ..registration.figures import ScanFigures, read_failures, review, write_doubts, write_failures, write_figures
 from ..registration.lead import Lead, lead_of
 from ..registration.person import person_parts
@@ -55,7 +56,7 @@ class PrepareConfig(Settings):
     """
 
     scan: ScanSettings = field(default_factory=ScanSettings)
-    skeleton: SkeletonConfig = field(default_factory=SkeletonConfig)
+    skeleton: Annotated[SkeletonConfig, NO_FLAGS] = field(default_factory=SkeletonConfig)
     min_poses: Count = 5
     workers: Workers = field(default_factory=Workers)
 

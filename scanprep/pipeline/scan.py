@@ -53,8 +53,6 @@ class ScanSettings(Settings):
     clean : CleanScanConfig, optional
         Take floor, furniture and specks off the scan before. Without it scans that have no landmarks are cleaned too,
         where a fifth of the points at most is taken off.
-    pictures : bool
-        Take a picture for the page of the set.
     """
 
     registration: RegistrationConfig = field(default_factory=RegistrationConfig)
@@ -62,7 +60,6 @@ class ScanSettings(Settings):
     through: Annotated[str, FLAG] = "auto"
     correspondences: CorrelatedConfig = field(default_factory=CorrelatedConfig)
     clean: CleanScanConfig | None = None
-    pictures: bool = True
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,8 +68,8 @@ class RegisteredScan:
 
     vertices: np.ndarray            # (N, 3), metres
     figures: ScanFigures
-    picture: bytes = b""            # strip of small pictures as WebP; empty where none were wanted
-    scene: bytes = b""              # the same for the browser
+    picture: bytes                  # strip of small pictures as WebP
+    scene: bytes                    # the same for the browser
     rival: RegisteredScan | None = None     # second body that explains the scan equally well
 
 
@@ -122,26 +119,24 @@ def register_scan(task: ScanTask, template: Mesh, template_landmarks: dict[str, 
             None if parts is None else find_exchanged_sides(template, parts, led.fit.mesh.vertices))
         if problem:
             raise ValueError(f"{task.scan}: {f'{wrong}: ' if wrong else ''}the template is not on it: {problem}")
-        registered = finish_scan(task.name, template, scan, led, parts, removed, settings.pictures)
+        registered = finish_scan(task.name, template, scan, led, parts, removed)
         doubts = (*([] if wrong is None else [PlausibilityIssue(100.0, wrong)]), *registered.figures.doubts,
                   *([] if registered.rival is None else [TWO_BODIES]))
     return replace(registered, figures=replace(registered.figures, doubts=doubts, seconds=time.perf_counter() - start))
 
 
 def finish_scan(name: str, template: Mesh, scan: Mesh | np.ndarray, led: LedRegistration, parts: PersonParts | None,
-                removed: float, pictures: bool) -> RegisteredScan:
+                removed: float) -> RegisteredScan:
     """Press the soles to the floor, measure the registration and take its picture; the same for its rival."""
-    fit = with_soles(template, scan, led.fit, parts)
-    picture = scene = b""
-    if pictures:
-        from .page import pictures_of
+    from .page import pictures_of
 
-        picture, scene = pictures_of(template, scan, fit)
+    fit = with_soles(template, scan, led.fit, parts)
+    picture, scene = pictures_of(template, scan, fit)
     doubts = () if parts is None else (*limb_doubts(template, parts, fit.mesh.vertices),
                                        *hidden_doubts(parts, fit.mesh, fit.seen),
                                        *size_doubts(template, parts, fit.mesh.vertices), *doubt_worn(led.worn))
     figures = replace(figures_of(name, led.way, template, fit), removed=removed, doubts=doubts)
-    rival = None if led.rival is None else finish_scan(name, template, scan, led.rival, parts, removed, pictures)
+    rival = None if led.rival is None else finish_scan(name, template, scan, led.rival, parts, removed)
     return RegisteredScan(fit.mesh.vertices, figures, picture, scene, rival)
 
 
@@ -181,11 +176,10 @@ class RegisterScan:
 
 
 def write_pictures(folder: Path, name: str, registered: RegisteredScan) -> None:
-    """Write the pictures of a scan into a folder, if they were taken."""
-    if registered.picture:
-        folder.mkdir(exist_ok=True)
-        (folder / f"{name}.webp").write_bytes(registered.picture)
-        (folder / f"{name}.scene").write_bytes(registered.scene)
+    """Write the pictures of a scan into a folder."""
+    folder.mkdir(exist_ok=True)
+    (folder / f"{name}.webp").write_bytes(registered.picture)
+    (folder / f"{name}.scene").write_bytes(registered.scene)
 
 
 def mesh_file(name: str) -> str:

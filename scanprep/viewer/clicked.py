@@ -12,6 +12,7 @@ from scipy.spatial import cKDTree
 from ..alignment.icp import landmark_motion
 from ..depth_camera.picture import is_picture, read_depth
 from ..geometry.files import UNITS, name_of, read_scan
+from ..geometry.landmark_writing import is_written
 from ..geometry.landmarks import landmarks_beside, read_landmarks, write_landmarks
 from ..geometry.mesh import Mesh
 from ..geometry.storage import keep_former
@@ -44,9 +45,13 @@ class Clicked:
 
     @classmethod
     def load(cls, path: Path, ending: str, unit: str | None = None, file: Path | None = None) -> Clicked:
-        """Load the landmarks of `file`, or of that beside the body; else a file with this ending is written later."""
+        """Load the landmarks of `file`, or of that beside the body.
+
+        Without one, or beside one whose format is only read, a file with this ending is written later.
+        """
         file = file or landmarks_beside(path)
-        one = cls(path, file or path.with_name(name_of(path) + ending), unit)
+        saved = file if file and is_written(file) else (file or path).with_name(name_of(path) + ending)
+        one = cls(path, saved, unit)
         if file is not None:
             one.places = one._read(file)
             one._order = tuple(one.places)

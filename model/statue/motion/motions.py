@@ -47,7 +47,7 @@ def read_statue_motion(statue: Statue, path: Path, rate: float | None = None) ->
         moving = set_in_motion(stored.skeleton, stored.poses, stored.trans, stored.rate)
         return _with_file_name(path, bvh_motion, control, statue.pose, moving), []
     if stored.of_family:
-        return _with_file_name(path, bvh_motion, control, statue.pose, moving_body(stored)[0]), []
+        return _with_file_name(path, bvh_motion, control, statue.pose, moving_body(stored)), []
     raise StorageError(f"{path}: it does not say which skeleton its {stored.poses.shape[1]} parts are of; make the "
                        "file again (scape animate, scape demo), or bring BVH")
 

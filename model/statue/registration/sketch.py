@@ -8,7 +8,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import ndimage
+from scipy import ndimage, sparse
+from scipy.sparse import csgraph
 from scipy.spatial import cKDTree
 
 from scanprep.geometry.mesh import Mesh
@@ -62,13 +63,13 @@ class Silhouette:
 
         ValueError where no start is inside.
         """
-        from skimage.graph import MCP_Geometric
-
         free = self.filled if free is None else free
         starts = starts[free[tuple(starts.T)]]
         if not len(starts):
             raise ValueError("scan: its silhouette is no star of five tips")
-        return np.asarray(MCP_Geometric(np.where(free, 1.0, -1.0)).find_costs(starts.tolist())[0])
+        first = np.ravel_multi_index(tuple(starts.T), free.shape)
+        return csgraph.dijkstra(_pixel_graph(np.where(free, 1.0, np.inf)), directed=False, indices=first,
+                                min_only=True).reshape(free.shape)
 
     def notch(self, tip: np.ndarray, other: np.ndarray) -> np.ndarray:
         """Find the deepest pixel (2,) between two tips, seen from the line that joins them, on the side of the first.
@@ -94,13 +95,33 @@ class Silhouette:
 
     def divide_limb(self, base: np.ndarray, tip: np.ndarray, shares: dict[str, float]) -> dict[str, np.ndarray]:
         """Find places (3,) at shares of the way from the base of a limb to its tip, in the middle of the limb."""
-        from skimage.graph import route_through_array
-
         # far from the border is cheap, so that the way is in the middle
         cost = np.where(self.filled, (1 + ndimage.distance_transform_edt(self.filled)) ** -2.0, 1e3)
-        way = np.array(route_through_array(cost, base.astype(int), tip.astype(int))[0], dtype=float)
+        first, last = (int(np.ravel_multi_index(tuple(pixel.astype(int)), cost.shape)) for pixel in (base, tip))
+        _, before = csgraph.dijkstra(_pixel_graph(cost), directed=False, indices=first, return_predecessors=True)
+        pixels = [last]
+        while pixels[-1] != first:
+            pixels.append(int(before[pixels[-1]]))
+        way = np.stack(np.unravel_index(pixels[::-1], cost.shape), axis=1).astype(float)
         gone = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(way, axis=0), axis=1))])
         return {name: self.place(way[np.searchsorted(gone, share * gone[-1])]) for name, share in shares.items()}
+
+
+def _pixel_graph(cost: np.ndarray) -> sparse.csr_array:
+    """Return the costs of steps between the eight neighbours of pixels (w, h): length times the mean of their costs.
+
+    Pixels of infinite cost cannot be entered.
+    """
+    number = np.arange(cost.size).reshape(cost.shape)
+    outside = np.pad(number, 1, constant_values=-1)
+    links = []
+    for across, up in ((1, 0), (0, 1), (1, 1), (1, -1)):
+        other = np.roll(outside, (-across, -up), axis=(0, 1))[1:-1, 1:-1]
+        free = (other >= 0) & np.isfinite(cost) & np.isfinite(cost.ravel()[other])
+        costs = np.hypot(across, up) * 0.5 * (cost[free] + cost.ravel()[other[free]])
+        links.append((costs, number[free], other[free]))
+    costs, starts, ends = (np.concatenate(columns) for columns in zip(*links, strict=True))
+    return sparse.csr_array((costs, (starts, ends)), shape=(cost.size, cost.size))
 
 
 def sketch_joints(scan: Mesh | np.ndarray) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
