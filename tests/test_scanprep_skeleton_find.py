@@ -17,7 +17,7 @@ from scanprep.skeleton.parts import PartSearch, SkeletonConfig
 from scanprep.skeleton.tree import Skeleton
 
 CELL = 0.04
-FEW = SkeletonConfig(patches=80, start=14)        # of patches: the figure is small, and the tests many
+FEW = SkeletonConfig(restarts=1)
 #         name       from            to            parent  joint
 BOXES = [("torso", (-4, -2, 0), (4, 2, 10), -1, (0, 0, 5)),          # no two parts of one size
          ("head", (-2, -2, 10), (2, 2, 15), 0, (0, 0, 10)),

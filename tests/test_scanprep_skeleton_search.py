@@ -18,7 +18,7 @@ from scanprep.skeleton.symmetry import Symmetry, find_symmetry, mirror_poses
 from scanprep.synthetic.anatomy import MIRROR_PART
 from scanprep.synthetic.people import SyntheticPerson, mirror_synthetic_pose
 
-CONFIG = SkeletonConfig(restarts=1, patches=120, start=20)
+CONFIG = SkeletonConfig(restarts=1)
 
 
 @pytest.fixture(scope="module")
@@ -227,16 +227,16 @@ def test_a_band_between_two_parts_is_no_part(animal, poses):
     assert passages(search, truth.part_of_face)[0].max() < 0.8
 
 
-def test_a_loop_is_opened_and_reported(animal, poses):
+def test_a_loop_is_opened(animal, poses):
     """The barrel cut into four quarters around its length: they close a loop, and become one."""
     surface, truth = PosedSurface(animal.mesh, poses), animal.skeleton
     search = PartSearch(surface, CONFIG)
     across = (animal.mesh.corners.mean(axis=1) @ ODD)[:, [1, 2]] > 0
     quarter = across @ [1, 2]
     label = np.where(truth.part_of_face == 0, np.where(quarter == 0, 0, quarter + 11), truth.part_of_face)
-    label, links, loops = to_tree(search, label)
-    assert loops and all(loop.length >= 3 for loop in loops) and any(loop.joined for loop in loops)
-    assert len(links) == label.max() and len(without_weak(search, label)) >= len(links)
+    count = label.max()
+    label, links = to_tree(search, label)
+    assert len(links) == label.max() < count and len(without_weak(search, label)) >= len(links)
 
 
 def test_costs_of_rigid_motions_without_the_motions():
@@ -253,6 +253,6 @@ def test_costs_of_rigid_motions_without_the_motions():
 
 
 def test_bad_settings_of_the_search_are_refused_by_name():
-    for name, value in (("restarts", 0), ("start", 0), ("separation", -1.0)):
+    for name, value in (("restarts", 0), ("separation", -1.0)):
         with pytest.raises(ValueError, match=name):
             replace(CONFIG, **{name: value})

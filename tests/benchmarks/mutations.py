@@ -171,7 +171,7 @@ MUTATIONS = (
     *of("scanprep/skeleton/sides.py", "scanprep_skeleton_search scanprep_skeleton_moves",
         ("borders of one side alone", "(2 if self.tied else 1)", "(1 if self.tied else 1)"),
         ("borders over the middle for nothing", "both += price * self.middle", "both += 0 * self.middle")),
-    *of("scanprep/skeleton/labels.py", "scanprep_skeleton_moves scanprep_skeleton_edit",
+    *of("scanprep/skeleton/labels.py", "scanprep_skeleton_moves",
         ("gain of the label that is left", "costs[:, alpha] - costs[np.arange(len(label)), label]",
          "costs[np.arange(len(label)), label] - costs[:, alpha]"),
         ("prices of a border twice", "(j_turns + i_turns - keep_cost) / unit)",
