@@ -48,17 +48,15 @@ def test_views_without_cameras_but_with_rough_landmarks(views):
     points = bumpy(3).vertices[[3, 70, 150, 210, 300]]
     clicked = [{str(k): R @ p + t + 0.0003 * rng.normal(size=3) for k, p in enumerate(points)} for R, t in frames]
     assert worst(lost, frames, views) > 0.3
-    found = align_views(lost, AlignViewsConfig(iterations=10), landmarks=clicked)
+    found = align_views(lost, landmarks=clicked)
     assert found.overlap.min() > 0.5 and found.conflict.max() < 0.01
     assert found.converged or not found.trusted.any()            # a smooth lump settles slowly; that is told
     assert worst(found.views, frames, views) < 0.005
-    for (mesh, _), (start, _), T in zip(found.views, lost, found.T_world_view, strict=True):
-        assert np.allclose(start.vertices @ T[:3, :3].T + T[:3, 3], mesh.vertices, atol=1e-9)
 
 
 def test_a_failure_is_told(views):
     lost, frames = moved(views, np.random.default_rng(2), turn=1.0, shift=0.05)
-    found = align_views(lost, AlignViewsConfig(iterations=10))
+    found = align_views(lost)
     assert worst(found.views, frames, views) > 0.02
     assert not found.trusted.all()
 
@@ -77,7 +75,7 @@ def test_fit_of_views_knows_right_from_wrong(views):
 def test_shapes_alone_bring_views_together(views):
     views = [views[k] for k in (0, 1, 2)]
     lost, frames = moved(views, np.random.default_rng(3))
-    found = align_views(lost, AlignViewsConfig(reach=0.02, iterations=15), np.random.default_rng(0), features=True)
+    found = align_views(lost, AlignViewsConfig(reach=0.02), features=True)
     if found.trusted.all():                      # a smooth lump may defeat it, but never without saying so
         assert worst(found.views, frames, views) < 0.002
     else:

@@ -10,7 +10,7 @@ import pytest
 from scanprep.correspondence import potentials as ce
 from scanprep.correspondence.correlated import find_correspondences, find_seeds, match_ends
 from scanprep.correspondence.potentials import SurfaceFeatures, gradients
-from scanprep.correspondence.search import BeliefLevel, CorrelatedConfig
+from scanprep.correspondence.search import CorrelatedConfig
 from scanprep.correspondence.sheet import Sheet
 from scanprep.geometry import rotations
 from scanprep.geometry.mesh import Mesh
@@ -18,7 +18,7 @@ from scanprep.geometry.surface import Surface
 from scanprep.geometry.target import Target, target_of
 from scanprep.synthetic.people import SyntheticPerson, find_pose
 
-SMALL = CorrelatedConfig(points=100, keep=80, levels=(BeliefLevel(1200, 60), BeliefLevel(10**6, 40)))
+SMALL = CorrelatedConfig(points=100)
 
 
 def dense(body: Mesh) -> Mesh:
@@ -72,7 +72,7 @@ def apart(found, truth: Mesh) -> np.ndarray:
 
 @pytest.mark.slow
 def test_five_seeds_on_overlapping_sheets_become_many_pairs(found, kicking):
-    assert len(found) == 80
+    assert len(found) > 80
     error = apart(found, kicking)
     assert np.median(error) < 0.02 and (error > 0.1).mean() <= 0.03
     assert found.confidence.min() >= 0 and found.confidence.max() <= 1
@@ -118,7 +118,7 @@ def test_wrong_seeds_are_refused(person, kicking):
 
 @pytest.mark.slow
 def test_seeds_are_found_without_a_click_and_not_swapped(person, kicking, ends):
-    seeds = find_seeds(person.mesh, sheets(kicking, np.random.default_rng(1)), hypotheses=6)
+    seeds = find_seeds(person.mesh, sheets(kicking, np.random.default_rng(1)))
     assert len(seeds) == 5 and seeds.converged
     # The same five places as the farthest points of the template, give or take a hand's breadth.
     nearest = np.linalg.norm(person.mesh.vertices[seeds.template_vertices][:, None] - person.mesh.vertices[ends],

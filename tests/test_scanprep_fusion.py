@@ -79,18 +79,6 @@ def test_colours_are_carried(views):
     assert np.abs(merged.colors - np.clip(merged.vertices / 0.4 + 0.5, 0, 1)).max() < 0.03
 
 
-def test_carving_removes_what_another_view_looks_through(shape, views):
-    rock = ball(2, 0.02)
-    floating = Mesh(rock.vertices + [0, 0.19, 0], rock.faces)
-    both = Mesh(np.concatenate([views[0][0].vertices, floating.vertices]),
-                np.concatenate([views[0][0].faces, floating.faces + len(views[0][0].vertices)]))
-    spoiled = [(both, views[0][1]), *views[1:]]
-    kept = merge_views(spoiled, MergeConfig(voxel=0.005, min_component=0.0))
-    carved = merge_views(spoiled, MergeConfig(voxel=0.005, min_component=0.0, carving=3.0))
-    assert kept.vertices[:, 1].max() > 0.18
-    assert carved.vertices[:, 1].max() < 0.15
-
-
 def test_views_are_checked(views):
     with pytest.raises(ValueError, match="views: expected at least one"):
         merge_views([])
@@ -115,8 +103,7 @@ def test_rough_cameras_are_aligned(shape, views):
     assert aligned.converged
     assert before > 0.004
     assert after < 0.0006
-    assert np.array_equal(aligned.T_world_view[0], np.eye(4))
-    for (mesh, camera), T, start in zip(aligned.views, aligned.T_world_view, rough, strict=True):
-        assert np.allclose(start[0].vertices @ T[:3, :3].T + T[:3, 3], mesh.vertices)
-        assert np.allclose(T[:3, :3] @ start[1] + T[:3, 3], camera)
-        assert np.allclose(T[:3, :3] @ T[:3, :3].T, np.eye(3))
+    assert np.array_equal(aligned.views[0][0].vertices, rough[0][0].vertices)
+    for (mesh, camera), start in zip(aligned.views, rough, strict=True):       # the camera moves with its view
+        R, t = rotations.procrustes(start[0].vertices, mesh.vertices)
+        assert np.allclose(start[0].vertices @ R.T + t, mesh.vertices) and np.allclose(R @ start[1] + t, camera)

@@ -24,7 +24,7 @@ from scanprep.synthetic.people import PARENTS, PARTS, BodyShape, SyntheticPerson
 
 FOREARM, SHIN, HEAD = (PARTS.index(name) for name in ("forearm_left", "shin_right", "head"))
 QUICK = RegistrationConfig((GraphStage(300, 0.09, 0.7, 0.01, 0.08, 0.0, rounds=3),
-                            GraphStage(300, 0.02, 0.7, 0.01, 0.05, 0.0, rounds=4)), final_fit=None)
+                            GraphStage(300, 0.02, 0.7, 0.01, 0.05, 0.0, rounds=4)), final_fit=False)
 
 
 @pytest.fixture(scope="module")

@@ -93,14 +93,6 @@ def test_seen_space_stays_empty():
     assert after < 0.6 * before
 
 
-def test_finer_voxels_find_the_same_surface():
-    holed = pierced(ball(5), [0, 0, 0.1], 0.05)
-    coarse, fine = (diffuse_surface(holed, holed.boundary_vertices, voxels=n) for n in (10, 14))
-    inner = fine.vertices[np.linalg.norm(fine.vertices - [0, 0, 0.1], axis=1) < 0.05]
-    assert Surface(coarse).closest(inner).distances.max() < 0.004
-    assert len(fine.faces) > 1.5 * len(coarse.faces)
-
-
 @pytest.mark.parametrize("method", ["fair", "diffusion"])
 def test_colours_are_continued(method):
     whole = ball(4)

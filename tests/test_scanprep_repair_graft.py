@@ -15,7 +15,7 @@ from scanprep.registration.matches import Fit
 from scanprep.registration.nonrigid import choose_fit_that_stays, covers, register, share_doubled
 from scanprep.repair.graft import bridge, find_missing, graft, with_islands
 from scanprep.repair.hole_filling import close
-from scanprep.surfaces.template import TemplateConfig, template_of_scan
+from scanprep.surfaces.template import template_of_scan
 from scanprep.synthetic.landmarks import landmarks
 from scanprep.synthetic.topology import load_topology
 
@@ -60,7 +60,7 @@ def test_a_fit_that_leaves_what_its_start_covers_is_not_kept(person, monkeypatch
     """Fingers beside a thigh were drawn to it, though the body that was found lay on the scan."""
     hand = np.linalg.norm(person.vertices - person.vertices[landmarks()["left middle finger"]], axis=1) < 0.1
     bent, beside = person.vertices + 0.05 * hand[:, None], person.vertices + 0.001
-    monkeypatch.setitem(nonrigid.METHODS, "graph", lambda inputs, begin, config, progress: Fit(bent))
+    monkeypatch.setattr(nonrigid, "register_graph", lambda inputs, begin, config, progress: Fit(bent))
     # the graph loses the hand: the final fit begins at the start; that loses it too: the start stays
     for snapped, kept in ((lambda x: x, person.vertices), (lambda x: bent, person.vertices),
                           (lambda x: beside, beside)):
@@ -85,12 +85,10 @@ def test_a_fit_that_fuses_two_fingers_is_not_kept():
 @pytest.mark.slow
 def test_a_template_has_the_fingers_that_its_scan_lacks(person, without_a_finger_tip):
     scan, tip = without_a_finger_tip
-    # the synthetic people's fingers are thinner than those of scans
-    config = TemplateConfig(thinnest=0.003)
-    made = template_of_scan(scan, 8000, config, person=person)
+    made = template_of_scan(scan, 8000, person=person)
     assert Surface(made.mesh).closest(tip[None]).distances[0] < 0.008
     assert any("piece" in note for note in made.notes)
-    assert Surface(template_of_scan(scan, 8000, config).mesh).closest(tip[None]).distances[0] > 0.015
+    assert Surface(template_of_scan(scan, 8000).mesh).closest(tip[None]).distances[0] > 0.015
 
 
 def test_a_strip_between_two_borders_closes_a_tube():

@@ -12,7 +12,7 @@ from .sides import Sides, cover, mirror_pairs
 from .symmetry import Symmetry
 
 PATCHES = 300                    # at first, about ten for each of the parts they are joined to
-START = 30                       # parts after the patches are joined, more than a person with fingers shows in scans
+START = 30                       # parts after the patches are joined: twice those of a person
 FADING = 0.8                     # a part dissolves when a blend of its neighbours explains this share of its motion
 
 

@@ -149,7 +149,7 @@ MUTATIONS = (
         ("noise in widths, not metres", "square = width**2 * np.sum", "square = np.sum"),
         ("data beyond the edge of a hole", "(~scan.border[found.index] | (beside <= scan.spacing))",
          "(beside < np.inf)"),
-        ("stiffness of a tension, not squared", "(stage.tension * self.size)**2", "(stage.tension * self.size)")),
+        ("stiffness of a tension, not squared", "(tension * self.size)**2", "(tension * self.size)")),
     *of("scanprep/registration/stretches.py", "scanprep_registration_final_fit",
         ("mean stretch is the area", "0.5 * np.log(area)", "np.log(area)"),
         ("hats turned round", "np.cross(n[:, None], e) / (2 *", "np.cross(e, n[:, None]) / (2 *"),
