@@ -63,14 +63,6 @@ def test_order_of_views_does_not_matter(views):
     assert np.abs(a.vertices - b.vertices).max() < 1e-9
 
 
-def test_a_whole_voxel_of_shift_changes_nothing(views):
-    shift = np.array([3, -2, 7]) * 4 * COARSE.voxel
-    moved = merge_views([(m.with_vertices(m.vertices + shift), c + shift) for m, c in views], COARSE)
-    still = merge_views(views, COARSE)
-    assert len(moved.vertices) == len(still.vertices)
-    assert Surface(still).closest(moved.vertices - shift).distances.max() < 1e-5
-
-
 def test_colours_are_carried(views):
     def painted(mesh):
         return Mesh(mesh.vertices, mesh.faces, np.clip(mesh.vertices / 0.4 + 0.5, 0, 1))

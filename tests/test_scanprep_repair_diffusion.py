@@ -2,7 +2,6 @@ import numpy as np
 import pytest
 from scanned_shapes import ball, bumpy, view
 
-from scanprep.geometry import rotations
 from scanprep.geometry.mesh import Mesh, template_problem
 from scanprep.geometry.surface import SeenSpace, Surface
 from scanprep.repair.hole_filling import FillConfig, fill_holes, fill_report
@@ -47,22 +46,6 @@ def test_patches_follow_the_volume_and_keep_the_mesh():
     assert filled.is_closed and template_problem(filled) is None and report.holes[0].intersections == 0
     assert np.array_equal(filled.vertices[:len(holed.vertices)], holed.vertices)
     assert Surface(bumpy(5)).closest(filled.vertices[len(holed.vertices):]).distances.max() < 0.004
-
-
-def test_diffusion_moves_along_with_the_mesh():
-    holed = pierced(bumpy(4), [0.1, 0, 0], 0.05)
-    R, t = rotations.exp(np.array([0.4, -1.1, 0.3])), np.array([0.2, -3.0, 1.0])
-    config = FillConfig(method="diffusion")
-    moved = fill_holes(holed.with_vertices(holed.vertices @ R.T + t), config)
-    assert Surface(fill_holes(holed, config)).closest((moved.vertices - t) @ R).distances.max() < 0.002
-
-
-def test_lines_of_sight_measure_how_far_space_is_empty():
-    shape = ball(4)
-    seen = SeenSpace([view(shape, [1, 0, 0])])
-    ahead = seen.ahead(np.array([[0.15, 0, 0], [0.1, 0, 0], [0.05, 0, 0], [0, 0.2, 0]]))
-    assert np.abs(ahead[:3] - [0.05, 0, -0.05]).max() < 0.001
-    assert ahead[3] == -np.inf                                  # nothing was seen behind it
 
 
 def test_what_was_seen_to_be_empty_is_outside():

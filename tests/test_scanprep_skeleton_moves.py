@@ -69,12 +69,6 @@ def test_labels_of_two_kinds_are_the_best_of_all_and_of_three_no_expansion_is_be
         assert energy <= min(field_energy(costs, pairs, prices, other) for other in others) + 1e-3    # whole numbers
 
 
-def test_a_group_in_pieces_keeps_them(search):
-    moments = search.surface.moments(search.patch)
-    half = halve(moments, np.array([[0, 1], [1, 2]]), np.zeros(len(moments.w), dtype=np.int64))
-    assert len(np.unique(half)) == len(moments.w) - 2
-
-
 @pytest.mark.parametrize("move", [dissolve_bands, PartSearch.join_down])
 @pytest.mark.timeout(60)
 def test_moves_that_the_alternation_takes_back_come_to_an_end(search, label, monkeypatch, move):

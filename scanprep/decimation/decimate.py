@@ -3,7 +3,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Annotated, Literal, NamedTuple, get_args
+from typing import Annotated, Literal, get_args
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -38,15 +38,6 @@ class DecimateConfig(Settings):
 
     method: Annotated[Method, FLAG] = "quadric"
     improve: bool = False
-
-
-class Decimation(NamedTuple):
-    """A decimated mesh, and its map to the original one."""
-
-    mesh: Mesh
-    owner: np.ndarray           # (N,) the new vertex of each original one
-    vertex_map: np.ndarray      # (n,) the original vertex of every new one: the survivor of its collapses
-    face_map: np.ndarray        # (f,) the original triangle of every new one
 
 
 @take_any_mesh
@@ -89,11 +80,14 @@ def decimate(mesh: Mesh, faces: int, config: DecimateConfig | None = None, keep:
     config = config or DecimateConfig()
     if config.method not in get_args(Method):
         raise ValueError(f"config.method: expected one of {', '.join(get_args(Method))}, got {config.method!r}")
-    _check(mesh, faces)
+    if faces < 4:
+        raise ValueError(f"faces: expected at least 4, got {faces}")
+    if not (mesh.is_edge_manifold and mesh.is_vertex_manifold):
+        raise ValueError("mesh: expected a manifold surface; repair it first")
     if faces >= len(mesh.faces):
         return mesh
     if config.method == "quadric":
-        smaller = collapse(mesh, faces, keep, progress).mesh
+        smaller = _collapse(mesh, faces, keep, progress)
     else:
         if keep is not None:
             raise ValueError(f"keep: the method {config.method!r} cannot keep them; expected 'quadric'")
@@ -108,13 +102,11 @@ def decimate(mesh: Mesh, faces: int, config: DecimateConfig | None = None, keep:
     return improve_triangles(smaller, Surface(mesh), fixed)
 
 
-def collapse(mesh: Mesh, faces: int, keep: np.ndarray | None = None,
-             progress: Callable[[int, int], None] | None = None) -> Decimation:
-    """Decimate with the method "quadric", and return the map of every vertex and triangle.
+def _collapse(mesh: Mesh, faces: int, keep: np.ndarray | None, progress: Callable[[int, int], None] | None) -> Mesh:
+    """Decimate with the method "quadric".
 
     [QEM] pair contraction
     """
-    _check(mesh, faces)
     centre = mesh.vertices.mean(axis=0)                       # far from the origin quadrics lose digits
     rounds = Rounds(mesh, (mesh.vertices - centre)[:, None], keep)
     rounds.run(faces, progress)
@@ -123,16 +115,7 @@ def collapse(mesh: Mesh, faces: int, keep: np.ndarray | None = None,
     # vertices that stay get their exact coordinates back
     same = rounds.kinds[kept] == FIXED
     vertices[same] = mesh.vertices[kept[same]]
-    smaller = Mesh(vertices, owner[mesh.faces[rounds.face_rows]], _mean_colors(mesh, owner, len(kept)))
-    return Decimation(smaller, owner, kept, rounds.face_rows)
-
-
-def _check(mesh: Mesh, faces: int) -> None:
-    """Raise ValueError for fewer than 4 triangles or a mesh that is not manifold."""
-    if faces < 4:
-        raise ValueError(f"faces: expected at least 4, got {faces}")
-    if not (mesh.is_edge_manifold and mesh.is_vertex_manifold):
-        raise ValueError("mesh: expected a manifold surface; repair it first")
+    return Mesh(vertices, owner[mesh.faces[rounds.face_rows]], _mean_colors(mesh, owner, len(kept)))
 
 
 def _mean_colors(mesh: Mesh, owner: np.ndarray, count: int) -> np.ndarray | None:

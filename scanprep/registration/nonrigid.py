@@ -305,38 +305,28 @@ def measure_fit(inputs: RegistrationProblem, fit: Fit, scan: Mesh | np.ndarray) 
     """Measure a fit against the whole scan, and return it with its quality figures."""
     body, size = inputs.template.with_vertices(fit.x), inputs.size
     # data within 1.5% of the size count, 2 cm on a man
-    data = evidence(body, inputs.target, 0.015 * size, NORMALS * size)
-    seen = data.confidence >= 0.5
+    confidence, distances = evidence(body, inputs.target, 0.015 * size, NORMALS * size)
+    seen = confidence >= 0.5
     landmark_rms = np.nan
     if inputs.landmarks is not None:
         apart = np.linalg.norm(fit.x[inputs.landmarks[0]] - inputs.landmarks[1], axis=1)
         landmark_rms = float(np.sqrt(np.mean(apart**2)))
     return Registration(
-        mesh=body, distances=np.where(seen, data.distances, np.nan), seen=seen,
-        rms=float(np.sqrt(body.vertex_areas[seen] @ data.distances[seen]**2 / body.vertex_areas[seen].sum()))
+        mesh=body, distances=np.where(seen, distances, np.nan), seen=seen,
+        rms=float(np.sqrt(body.vertex_areas[seen] @ distances[seen]**2 / body.vertex_areas[seen].sum()))
         if seen.any() else np.nan, landmark_rms=landmark_rms,
         converged=bool(fit.moved <= 0.001 * size and seen.any()), iterations=fit.iterations, energies=fit.energies,
-        inverted=int(find_inverted_triangles(inputs.template, fit.x).sum()), confidence=data.confidence,
+        inverted=int(find_inverted_triangles(inputs.template, fit.x).sum()), confidence=confidence,
         uncovered=share_uncovered(scan, body, 0.01 * size))
 
 
-@dataclass(frozen=True, eq=False)
-class Evidence:
-    """How well the scan supports every vertex of a registered template.
+def evidence(deformed: Mesh, target: Target, reach: float, scale: float) -> tuple[np.ndarray, np.ndarray]:
+    """Weigh the data near every vertex of a registered template: the confidence in them and their distances (N,).
 
-    The confidence (N,) goes from 0, no data here, to 1: a scanned surface lies here, faces the same way and does not
-    end here, and its points match this part of the template too. Distances (N,), metres, are to the tangent plane at
-    the nearest point that faces the same way; NaN where that is too far.
-    """
-
-    confidence: np.ndarray
-    distances: np.ndarray
-
-
-def evidence(deformed: Mesh, target: Target, reach: float, scale: float) -> Evidence:
-    """Weigh the data near every vertex of a registered template; points beyond `reach` (metres) count for nothing.
-
-    A unit difference of normals counts like a distance of `scale` metres.
+    The confidence goes from 0, no data here, to 1: a scanned surface lies here, faces the same way and does not end
+    here, and its points match this part of the template too. Distances, metres, are to the tangent plane at the nearest
+    point that faces the same way; NaN where that is too far. Points beyond `reach` (metres) count for nothing. A unit
+    difference of normals counts like a distance of `scale` metres.
     """
     def ramp(value: np.ndarray, low: float, high: float) -> np.ndarray:
         return np.clip((value - low) / (high - low), 0, 1)
@@ -370,7 +360,7 @@ def evidence(deformed: Mesh, target: Target, reach: float, scale: float) -> Evid
     inside = np.exp(-0.5 * (np.maximum(nearest - 2 * spacing, 0) / (2 * spacing)) ** 2) * (1 - ramp(edge, 0.3, 0.9))
     confidence, distances = np.zeros(len(x)), np.full(len(x), np.nan)
     confidence[v], distances[v] = near * facing * (inside * chosen)[v], off
-    return Evidence(confidence, distances)
+    return confidence, distances
 
 
 def share_uncovered(scan: Mesh | np.ndarray, registered: Mesh, far: float) -> float:

@@ -95,7 +95,7 @@ MUTATIONS = (
          "weights[:, None] * np.ones_like(along[..., 0])"),
         ("least error mirrored at the origin", "return -np.stack([c0 * bx", "return np.stack([c0 * bx"),
         ("mixed terms once", "2 * (Q[..., 1] * x1", "1 * (Q[..., 1] * x1")),
-    *of("scanprep/decimation/edge_collapse.py", "scanprep_decimation",
+    *of("scanprep/decimation/edge_collapse.py", "scanprep_decimation scanprep_decimation_set",
         ("the vertex of greater error kept", "self.points[b]).sum(axis=1) < value",
          "self.points[b]).sum(axis=1) > value"),
         ("curves may leave their place", "anchored = (self.kinds[a] != self.kinds[b]) | ", "anchored = "),
