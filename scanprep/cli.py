@@ -46,7 +46,7 @@ COMMANDS = {
                    "scanprep.registration.cli:correspond"),
     "register": ("Bend the template onto one scan.", "scanprep.registration.cli:register_one"),
     "skeleton": ("Rigid parts, joints and a tree from registered poses.", "scanprep.skeleton.cli:skeleton"),
-    "edit-skeleton": ("Merge, split and rename parts, move joints, by hand or from a file.",
+    "edit-skeleton": ("Merge and rename parts, move joints, by hand or from a file.",
                       "scanprep.skeleton.cli:edit"),
 }
 

@@ -9,7 +9,7 @@ from jointed_bodies import crab
 from scanprep.registration.schedule import GraphStage
 from scanprep.skeleton.tree import Skeleton
 
-COARSE = replace(QUICK, registration=replace(QUICK.registration, final_fit=None))     # bodies of 398 vertices
+COARSE = replace(QUICK, registration=replace(QUICK.registration, final_fit=False))     # bodies of 398 vertices
 PLAIN = replace(QUICK.registration, graph=(GraphStage(80, 0.2, 0.7, 0.01, 0.21),
                                            GraphStage(80, 0.13, 0.7, 0.01, 0.15), *QUICK.registration.graph))
 FAR = np.array([0, -1.3, 0.1]), np.array([0.1, 1.3, 0.2])          # both arms far from the template's

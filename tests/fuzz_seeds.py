@@ -32,7 +32,7 @@ from model.posing.cli import _read_betas, _read_turns
 from model.statue.own_mesh import read_pieces
 from scanprep import Mesh, RegisteredSet, read_landmarks, read_mesh, write_landmarks, write_mesh
 from scanprep.correspondence.correspondences import Correspondences, read_correspondences, write_correspondences
-from scanprep.decimation.registered_set import DecimateSetConfig, _load_map, write_decimated_set
+from scanprep.decimation.registered_set import _load_map, write_decimated_set
 from scanprep.geometry import storage
 from scanprep.geometry.files import PointCloud, read_points, write_points
 from scanprep.geometry.landmarks import read_landmark_vertices
@@ -291,10 +291,10 @@ def _add_sets(rng: np.random.Generator, place: Any, add: Any, text: Any) -> None
     for name in ("completion.npz", "predicted.ply"):
         done.save(place("done"))
         add(place("done") / name, lambda path: load_completion(path.parent), good_completion)
-    source, config = filled(place("source")), DecimateSetConfig(meshes=1)
-    write_decimated_set(source, place("small"), 60, config)
+    source = filled(place("source"))
+    write_decimated_set(source, place("small"), 60)
     add(place("small") / "decimation.npz", lambda path: _load_map(
-        path, source, config, {k: storage.kind_of_stored(path) and v for k, v in _settings(path).items()}),
+        path, source, {k: storage.kind_of_stored(path) and v for k, v in _settings(path).items()}),
         lambda found: good_mesh(found.template))
     write_correspondences(path := place("pairs.json"), Correspondences(
         np.arange(4), rng.random((4, 3)), np.ones(4), "manual", {"all": float("nan")}, True))

@@ -74,7 +74,7 @@ def test_what_does_not_fit_is_refused(body, layout):
     target, _ = renumbered(body, np.random.default_rng(1))
     far = target.with_vertices(4 * target.vertices)
     with pytest.raises(ValueError, match=r"target: .* brought onto it, (99|100)% .* give landmarks"):
-        transfer_layout(layout, body, far, config=replace(NEAR, final_fit=None), search=False)
+        transfer_layout(layout, body, far, config=replace(NEAR, final_fit=False), search=False)
     with pytest.raises(ValueError, match="marker 'A' sits on vertex 99999"):
         transfer_layout(MarkerLayout(("A",), np.array([99_999])), body, target)
     with pytest.raises(ValueError, match="landmarks: expected"):

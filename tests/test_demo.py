@@ -39,7 +39,7 @@ SMALL = replace(QUICK, poses=3, subjects=1, faces=2000, resolution=0.02, templat
 FEW_STEPS = PrepareConfig(
     ScanSettings(RegistrationConfig(tuple(replace(stage, nodes=min(stage.nodes, 100), rounds=2, ends=0)
                                           for stage in RegistrationConfig().graph)), through="none"),
-    SkeletonConfig(restarts=1, patches=40), min_poses=3)
+    SkeletonConfig(restarts=1), min_poses=3)
 
 
 @contextmanager

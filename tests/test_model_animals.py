@@ -9,7 +9,7 @@ from scanprep.skeleton.find import find_skeleton
 from scanprep.skeleton.parts import SkeletonConfig
 
 CONFIG = LearnConfig(prunings=(0.01,), ridges=(0.001,), refinements=1)
-TWELVE = SkeletonConfig(parts=12, patches=100, start=20)
+TWELVE = SkeletonConfig(parts=12)
 
 
 @pytest.fixture(scope="module")

@@ -138,7 +138,7 @@ def test_a_mesh_of_other_triangles_is_registered(drawn, tmp_path):
     model = worm_model()
     model = replace(model, template=Mesh(model.template.vertices, model.template.faces[:, ::-1]))
     stages = RegistrationConfig().graph
-    quick = RegistrationConfig(graph=(stages[3], replace(stages[7], ends=0)), final_fit=None)
+    quick = RegistrationConfig(graph=(stages[3], replace(stages[7], ends=0)), final_fit=False)
     found = register_character(model, mesh, theirs, ours, quick)
     assert found.registration.uncovered < 0.05 and found.registration.inverted == 0 and found.inside.all()
     wanted = np.array([[0, 0, 0], [-0.35, 0, 0], [0.2625, 0, 0], [0.525, 0, 0]]) @ rotations.exp([0, 0, 2.0]).T * 2

@@ -42,7 +42,7 @@ def slow(field: PairField, rounds: int, damping: float) -> np.ndarray:
 @pytest.mark.parametrize("seed", range(3))
 def test_matrix_products_give_the_messages_of_the_definition(seed):
     field = random_field(LOOPY, np.random.default_rng(seed))
-    fast = propagate(field, iterations=7, damping=0.3, tolerance=0.0)
+    fast = propagate(field, 7, 0.0)
     assert fast.iterations == 7
     assert np.allclose(fast.probabilities, slow(field, 7, 0.3), atol=1e-5)
 
@@ -53,14 +53,14 @@ def test_marginals_on_a_tree_are_those_of_all_assignments(seed):
     total = np.zeros_like(field.unary)
     for states in product(range(3), repeat=len(total)):
         total[np.arange(len(total)), states] += np.exp(-field.energy(np.array(states)))
-    found = propagate(field, iterations=200, tolerance=1e-9)
+    found = propagate(field, 200, 1e-9)
     assert found.converged
     assert np.allclose(found.probabilities, total / total.sum(axis=1, keepdims=True), atol=1e-5)
 
 
 def test_variables_without_edges_keep_their_own_opinion():
     field = PairField(np.array([[1.0, 0.0], [0.0, 3.0]]), np.zeros((0, 2), dtype=int), np.zeros((0, 2, 2)))
-    found = propagate(field)
+    found = propagate(field, 40)
     assert found.converged and found.states.tolist() == [1, 0]
     assert np.allclose(found.probabilities, [[1 / (1 + np.e), np.e / (1 + np.e)],
                                              [1 / (1 + np.exp(-3)), np.exp(-3) / (1 + np.exp(-3))]])
@@ -70,5 +70,5 @@ def test_states_that_are_not_there_are_never_believed():
     field = random_field(LOOPY, np.random.default_rng(1))
     unary = field.unary.copy()
     unary[2, 1] = np.inf
-    found = propagate(PairField(unary, field.edges, field.pairwise))
+    found = propagate(PairField(unary, field.edges, field.pairwise), 40)
     assert found.probabilities[2, 1] < 1e-20 and np.isfinite(found.probabilities).all()

@@ -8,17 +8,14 @@ import numpy as np
 import pytest
 
 from scanprep.correspondence import potentials as ce
-from scanprep.correspondence.correlated import find_correspondences, find_seeds, match_ends
-from scanprep.correspondence.potentials import SurfaceFeatures, gradients
-from scanprep.correspondence.search import BeliefLevel, CorrelatedConfig
-from scanprep.correspondence.sheet import Sheet
+from scanprep.correspondence.correlated import find_correspondences, find_seeds
+from scanprep.correspondence.potentials import SurfaceFeatures
+from scanprep.correspondence.search import CorrelatedConfig
 from scanprep.geometry import rotations
 from scanprep.geometry.mesh import Mesh
-from scanprep.geometry.surface import Surface
-from scanprep.geometry.target import Target, target_of
 from scanprep.synthetic.people import SyntheticPerson, find_pose
 
-SMALL = CorrelatedConfig(points=100, keep=80, levels=(BeliefLevel(1200, 60), BeliefLevel(10**6, 40)))
+SMALL = CorrelatedConfig(points=100)
 
 
 def dense(body: Mesh) -> Mesh:
@@ -72,17 +69,11 @@ def apart(found, truth: Mesh) -> np.ndarray:
 
 @pytest.mark.slow
 def test_five_seeds_on_overlapping_sheets_become_many_pairs(found, kicking):
-    assert len(found) == 80
+    assert len(found) > 80
     error = apart(found, kicking)
     assert np.median(error) < 0.02 and (error > 0.1).mean() <= 0.03
     assert found.confidence.min() >= 0 and found.confidence.max() <= 1
     assert (np.diff(found.confidence) <= 0).all()
-
-
-@pytest.mark.slow
-def test_doubtful_pairs_are_worse(found, kicking):
-    error = apart(found, kicking)
-    assert error[:40].mean() < error[40:].mean()
 
 
 @pytest.mark.slow
@@ -118,63 +109,13 @@ def test_wrong_seeds_are_refused(person, kicking):
 
 @pytest.mark.slow
 def test_seeds_are_found_without_a_click_and_not_swapped(person, kicking, ends):
-    seeds = find_seeds(person.mesh, sheets(kicking, np.random.default_rng(1)), hypotheses=6)
+    seeds = find_seeds(person.mesh, sheets(kicking, np.random.default_rng(1)))
     assert len(seeds) == 5 and seeds.converged
     # The same five places as the farthest points of the template, give or take a hand's breadth.
     nearest = np.linalg.norm(person.mesh.vertices[seeds.template_vertices][:, None] - person.mesh.vertices[ends],
                              axis=2)
     assert sorted(nearest.argmin(axis=1)) == [0, 1, 2, 3, 4] and nearest.min(axis=1).max() < 0.12
     assert apart(seeds, kicking).max() < 0.08
-
-
-def test_ends_are_matched_by_the_ways_between_them():
-    rng = np.random.default_rng(3)
-    x = rng.normal(size=(5, 3))
-    ways = np.linalg.norm(x[:, None] - x, axis=2)
-    order = rng.permutation(5)
-    best = match_ends(ways, 1.1 * ways[np.ix_(order, order)], 8)[0]
-    assert (order[best] == np.arange(5)).all()
-    lost = order[:4]                                         # one end of the scan is hidden
-    best = match_ends(ways, ways[np.ix_(lost, lost)], 8)[0]
-    assert (best == -1).sum() == 1 and (lost[best[best >= 0]] == np.flatnonzero(best >= 0)).all()
-
-
-def two_plates(gap: float) -> Target:
-    """Two parallel plates that face each other across a gap."""
-    g = np.stack(np.meshgrid(np.arange(0, 0.3, 0.01), np.arange(0, 0.3, 0.01), indexing="ij"), -1).reshape(-1, 2)
-    lower = np.column_stack([g, np.zeros(len(g))])
-    upper = np.column_stack([g, np.full(len(g), gap)])
-    up = np.broadcast_to([0.0, 0.0, 1.0], lower.shape)
-    return Target(np.vstack([lower, upper]), np.vstack([up, -up]), np.zeros(2 * len(g), dtype=bool), True)
-
-
-def test_paths_do_not_jump_between_surfaces_that_face_each_other():
-    sheet = Sheet(two_plates(0.012), 0.01)
-    side = sheet.normals[:, 2] > 0
-    i, j = sheet.surface.nonzero()
-    assert (side[i] == side[j]).all()
-
-
-def test_paths_cross_overlapping_sheets():
-    one = two_plates(0.012)
-    half = one.normals[:, 2] > 0
-    points = one.points[half] + 0.002 * (np.arange(half.sum()) % 2)[:, None] * one.normals[half]
-    left, right = points[points[:, 0] < 0.17], points[points[:, 0] > 0.13]
-    both = np.vstack([left, right + [0, 0.004, 0.001]])
-    target = Target(both, np.broadcast_to([0.0, 0.0, 1.0], both.shape), np.zeros(len(both), dtype=bool), True)
-    sheet = Sheet(target, 0.01)
-    a, b = sheet.at(np.array([[0.0, 0.15, 0.0], [0.29, 0.15, 0.0]]))
-    straight = np.linalg.norm(sheet.points[a] - sheet.points[b])
-    assert straight <= sheet.distances(np.array([a]))[0, b] < 1.06 * straight
-
-
-def test_gradients_of_a_linear_function_are_its_direction():
-    target = two_plates(0.5)
-    points, normals = target.points[:900], target.normals[:900]
-    slope = np.array([0.6, 0.8, 0.0])
-    inside = np.flatnonzero((np.abs(points[:, :2] - 0.15) < 0.08).all(axis=1))
-    found = gradients(points, normals, (points @ slope)[None], inside, 0.04)
-    assert np.allclose(found[0], slope, atol=1e-3)
 
 
 def test_energies_of_true_images_are_zero_and_mirrors_cost():
@@ -196,13 +137,3 @@ def test_energies_of_true_images_are_zero_and_mirrors_cost():
     # The table of (i, j) is that of (j, i) turned over.
     assert np.allclose(table, ce.edge_energy(places, places, edges[:, ::-1], domains, 1.0).transpose(0, 2, 1),
                        atol=1e-5)
-
-
-def test_a_cloud_without_normals_gets_them_outward(kicking):
-    rng = np.random.default_rng(0)
-    # 1.2 cm apart: of 9,000, which are 1.5 cm apart, 3% came out inward, most of them on hands
-    points, _, _ = kicking.sample(15000, rng)
-    sheet = Sheet(target_of(points), 0.02)
-    near = Surface(kicking).closest(sheet.points)
-    agree = np.einsum("nd,nd->n", sheet.normals, kicking.face_normals[near.faces])
-    assert (agree > 0).mean() > 0.97

@@ -5,8 +5,7 @@ from scanned_shapes import bumpy
 from surface_distances import surface_distance
 
 from scanprep.dataset import RegisteredSet
-from scanprep.decimation import registered_set as decimate_set_files
-from scanprep.decimation.registered_set import DecimateSetConfig, decimate_set, write_decimated_set
+from scanprep.decimation.registered_set import decimate_set, write_decimated_set
 from scanprep.geometry.landmarks import read_landmark_vertices, write_landmarks
 from scanprep.geometry.mesh import template_problem
 from scanprep.skeleton.tree import Skeleton
@@ -32,27 +31,22 @@ def skeleton(body):
     return Skeleton(part, [-1, 0, 0], [middle, [-0.2, 0, 0], [0.2, 0, 0]], ("chest", "left", "right"))
 
 
-@pytest.mark.parametrize("placement", ["vertices", "solved"])
-def test_one_topology_for_all(body, poses, skeleton, placement):
-    small = decimate_set(body, poses, 500, DecimateSetConfig(placement=placement), KEEP, skeleton)
+def test_one_topology_for_all(body, poses, skeleton):
+    small = decimate_set(body, poses, 500, KEEP, skeleton)
     assert template_problem(small.template) is None and small.template.is_closed
     assert len(small.template.faces) == 500
     assert set(KEEP) <= set(small.vertex_map)
     assert np.array_equal(small.owner[small.vertex_map], np.arange(len(small.vertex_map)))
     assert np.array_equal(small.template.faces, small.owner[body.faces[small.face_map]])
+    assert np.array_equal(small.template.vertices, body.vertices[small.vertex_map])
     carried = small.transfer(poses)
+    assert np.array_equal(carried, poses[:, small.vertex_map])
     assert carried.shape == (len(poses), len(small.vertex_map), 3)
     for before, after in zip(poses, carried, strict=True):
         assert np.array_equal(after[small.owner[KEEP]], before[KEEP])
         mesh, now = body.with_vertices(before), small.template.with_vertices(after)
         assert surface_distance(mesh, now, 5000).mean < 0.1 * now.mean_edge
         assert now.volume == pytest.approx(mesh.volume, rel=0.03)
-
-
-def test_the_map_is_exact(body, poses, skeleton):
-    small = decimate_set(body, poses, 500, None, KEEP, skeleton)
-    assert np.array_equal(small.transfer(poses), poses[:, small.vertex_map])
-    assert np.array_equal(small.template.vertices, body.vertices[small.vertex_map])
 
 
 def borders(faces, part):
@@ -65,7 +59,7 @@ def borders(faces, part):
 
 
 def test_borders_of_parts_stay_curves_on_them(body, poses, skeleton):
-    small = decimate_set(body, poses, 300, None, KEEP, skeleton)
+    small = decimate_set(body, poses, 300, KEEP, skeleton)
     assert small.skeleton.names == skeleton.names
     assert np.array_equal(small.skeleton.part_of_face, skeleton.part_of_face[small.face_map])
     assert np.array_equal(small.skeleton.joints[1:], skeleton.joints[1:])
@@ -83,9 +77,8 @@ def test_borders_of_parts_stay_curves_on_them(body, poses, skeleton):
 def test_what_bends_in_a_pose_keeps_its_triangles(body):
     poses = np.stack([bent(body, [0, 0, 1.8], [0, 0, 0])])
     near = np.abs(body.vertices[:, 0] + 0.2) < 0.06
-    count = {m: np.count_nonzero(near[decimate_set(body, poses, 400, DecimateSetConfig(meshes=m)).vertex_map])
-             for m in (1, 2)}
-    assert count[2] > count[1]
+    alone, together = (np.count_nonzero(near[decimate_set(body, others, 400).vertex_map]) for others in (None, poses))
+    assert together > alone
 
 
 def test_meshes_in_other_places_change_nothing(body, poses):
@@ -110,10 +103,6 @@ def test_colours_and_landmarks_are_carried(body):
 def test_arguments_are_checked(body, poses, skeleton):
     with pytest.raises(ValueError, match="poses: expected shape"):
         decimate_set(body, poses[:, :-1], 500)
-    with pytest.raises(ValueError, match=r"config\.placement"):
-        decimate_set(body, poses, 500, DecimateSetConfig(placement="anywhere"))
-    with pytest.raises(ValueError, match="meshes: expected 1"):
-        decimate_set(body, poses, 500, DecimateSetConfig(meshes=0))
     with pytest.raises(ValueError, match="keep: expected vertices"):
         decimate_set(body, poses, 500, keep=[10**6])
     with pytest.raises(ValueError, match="skeleton: expected"):
@@ -150,7 +139,7 @@ def test_a_set_made_without_landmarks(source, tmp_path):
     assert len(write_decimated_set(source.folder, tmp_path / "small", 500).template.faces) == 500
 
 
-def test_what_was_interrupted_goes_on(source, tmp_path, monkeypatch):
+def test_what_was_interrupted_goes_on(source, tmp_path):
     folder = tmp_path / "small"
 
     def stop(done, total):
@@ -162,12 +151,10 @@ def test_what_was_interrupted_goes_on(source, tmp_path, monkeypatch):
     first = RegisteredSet.load(folder)
     assert first.names == source.names[:2]
     times = [(folder / e.file).stat().st_mtime_ns for e in first.entries]
-    monkeypatch.setattr(decimate_set_files, "decimate_set", lambda *_: pytest.fail("the map is there"))
     more = source.add("late", source.vertices()[0], "Bea")
     whole = write_decimated_set(more, folder, 500)
     assert whole.names == more.names
     assert [(folder / e.file).stat().st_mtime_ns for e in first.entries] == times
-    monkeypatch.undo()
     fresh = write_decimated_set(source, tmp_path / "fresh", 500)
     assert np.array_equal(fresh.vertices(), whole.vertices(fresh.names))
 

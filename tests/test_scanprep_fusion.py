@@ -63,32 +63,12 @@ def test_order_of_views_does_not_matter(views):
     assert np.abs(a.vertices - b.vertices).max() < 1e-9
 
 
-def test_a_whole_voxel_of_shift_changes_nothing(views):
-    shift = np.array([3, -2, 7]) * 4 * COARSE.voxel
-    moved = merge_views([(m.with_vertices(m.vertices + shift), c + shift) for m, c in views], COARSE)
-    still = merge_views(views, COARSE)
-    assert len(moved.vertices) == len(still.vertices)
-    assert Surface(still).closest(moved.vertices - shift).distances.max() < 1e-5
-
-
 def test_colours_are_carried(views):
     def painted(mesh):
         return Mesh(mesh.vertices, mesh.faces, np.clip(mesh.vertices / 0.4 + 0.5, 0, 1))
 
     merged = merge_views([(painted(m), c) for m, c in views], COARSE)
     assert np.abs(merged.colors - np.clip(merged.vertices / 0.4 + 0.5, 0, 1)).max() < 0.03
-
-
-def test_carving_removes_what_another_view_looks_through(shape, views):
-    rock = ball(2, 0.02)
-    floating = Mesh(rock.vertices + [0, 0.19, 0], rock.faces)
-    both = Mesh(np.concatenate([views[0][0].vertices, floating.vertices]),
-                np.concatenate([views[0][0].faces, floating.faces + len(views[0][0].vertices)]))
-    spoiled = [(both, views[0][1]), *views[1:]]
-    kept = merge_views(spoiled, MergeConfig(voxel=0.005, min_component=0.0))
-    carved = merge_views(spoiled, MergeConfig(voxel=0.005, min_component=0.0, carving=3.0))
-    assert kept.vertices[:, 1].max() > 0.18
-    assert carved.vertices[:, 1].max() < 0.15
 
 
 def test_views_are_checked(views):
@@ -115,8 +95,7 @@ def test_rough_cameras_are_aligned(shape, views):
     assert aligned.converged
     assert before > 0.004
     assert after < 0.0006
-    assert np.array_equal(aligned.T_world_view[0], np.eye(4))
-    for (mesh, camera), T, start in zip(aligned.views, aligned.T_world_view, rough, strict=True):
-        assert np.allclose(start[0].vertices @ T[:3, :3].T + T[:3, 3], mesh.vertices)
-        assert np.allclose(T[:3, :3] @ start[1] + T[:3, 3], camera)
-        assert np.allclose(T[:3, :3] @ T[:3, :3].T, np.eye(3))
+    assert np.array_equal(aligned.views[0][0].vertices, rough[0][0].vertices)
+    for (mesh, camera), start in zip(aligned.views, rough, strict=True):       # the camera moves with its view
+        R, t = rotations.procrustes(start[0].vertices, mesh.vertices)
+        assert np.allclose(start[0].vertices @ R.T + t, mesh.vertices) and np.allclose(R @ start[1] + t, camera)

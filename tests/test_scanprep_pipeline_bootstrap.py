@@ -20,7 +20,7 @@ from scanprep.pipeline.scan import ScanSettings
 from scanprep.pipeline.scans import find_scans
 from scanprep.registration.graph_fit import register_graph
 from scanprep.registration.matches import Fit
-from scanprep.registration.nonrigid import METHODS, LedRegistration, register
+from scanprep.registration.nonrigid import LedRegistration, register
 from scanprep.registration.schedule import RegistrationConfig
 from scanprep.registration.unmarked import register_by_any
 from scanprep.skeleton.tree import Skeleton
@@ -86,7 +86,8 @@ def lose_bad_scans(patch, truth, skeleton):
     What starts at the truth stays there: the few nodes of a quick graph would make a good scan doubtful.
     """
     made = []
-    patch.setitem(METHODS, "graph", lambda inputs, begin, config, progress: Fit(begin) if begin.shape != (4, 4)
+    patch.setattr("scanprep.registration.nonrigid.register_graph",
+                  lambda inputs, begin, config, progress: Fit(begin) if begin.shape != (4, 4)
                   else register_graph(inputs, begin, config, progress))
 
     def first_then_model(template, scan, landmarks, lead, *args):

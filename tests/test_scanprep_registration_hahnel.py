@@ -56,21 +56,6 @@ def test_nodes_rotate_but_do_not_grow():
     assert np.ptp(larger.x[:, 0]) < 1.02 * np.ptp(crab().vertices[:, 0])
 
 
-def test_softer_links_follow_more():
-    wanted = bent(crab(), LEFT, RIGHT)
-    apart = [off(linked(begun(), all_wanted(wanted), length * SIZE), wanted) for length in (2.0, 0.3, 0.03)]
-    assert apart[0] > 1.5 * apart[1] > 3 * apart[2]
-
-
-def test_a_finer_graph_goes_on_from_the_coarser_one():
-    wanted, fit = bent(crab(), LEFT, RIGHT), begun()
-    for _ in range(5):
-        fit = linked(fit, all_wanted(wanted), 0.1 * SIZE)
-    after = linked(fit.refine(GIVEN.template, 200), all_wanted(wanted), 0.1 * SIZE)
-    assert np.linalg.norm(after.x - fit.x, axis=1).mean() < 0.01
-    assert off(after, wanted) < off(fit, wanted) + 0.002
-
-
 @pytest.mark.slow
 def test_the_published_registration_bends_the_body_too():
     stages = RegistrationConfig.from_paper().graph

@@ -1,15 +1,12 @@
 import numpy as np
 import pytest
 
-from scanprep.correspondence.correspondences import Correspondences
 from scanprep.geometry import rotations
 from scanprep.geometry.target import target_of
 from scanprep.judgement import size
 from scanprep.pipeline.scan import size_doubts
-from scanprep.registration import unmarked
 from scanprep.registration.limb_ends import RigidFit, bending, find_ends, rotate_ends
 from scanprep.registration.limbs import frames, hidden_doubts, limb_doubts, part_angles, part_bending, rolls
-from scanprep.registration.nonrigid import Registration
 from scanprep.registration.person import PersonParts, average_person
 from scanprep.skeleton.tree import Skeleton
 from scanprep.synthetic.people import NAMED_POSES, PARTS, find_pose
@@ -98,26 +95,6 @@ def test_bending_leaves_out_place_rotation_and_size():
     off, growth = bending(points, moved)
     assert off < 1e-12 and np.isclose(growth, np.log(1.7))
     assert bending(points, moved + 0.1 * twisted)[0] > 0.05
-
-
-@pytest.mark.parametrize("first, second, kept", [(0.001, 0.0, [None]), (0.03, 0.002, [None, 5]),
-                                                 (0.03, 0.04, [None, 5])])
-def test_where_a_limb_was_lost_its_ends_lead(person, monkeypatch, first, second, kept):
-    """A scan that is covered is registered once; else again with its ends, and what covers more is kept."""
-    ends = Correspondences(np.arange(5), np.zeros((5, 3)), np.ones(5))
-    led = []
-
-    def register(template, scan, landmarks, *rest):
-        led.append(None if landmarks is None else len(landmarks[0]))
-        nothing = np.zeros(0)
-        return Registration(template, nothing, nothing, 0.0, 0.01, True, 1, {}, 0, nothing,
-                            first if landmarks is None else second)
-
-    monkeypatch.setattr(unmarked, "find_seeds", lambda *args: ends)
-    monkeypatch.setattr(unmarked, "find_correspondences", lambda *args: ends)
-    monkeypatch.setattr(unmarked, "register", register)
-    fit, _ = unmarked.register_unmarked(person.mesh, person.mesh)
-    assert led == kept and fit.uncovered == (min(first, second) if len(kept) > 1 else first)
 
 
 def test_a_hand_bent_at_the_wrist_is_found(person):

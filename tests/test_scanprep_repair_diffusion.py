@@ -2,7 +2,6 @@ import numpy as np
 import pytest
 from scanned_shapes import ball, bumpy, view
 
-from scanprep.geometry import rotations
 from scanprep.geometry.mesh import Mesh, template_problem
 from scanprep.geometry.surface import SeenSpace, Surface
 from scanprep.repair.hole_filling import FillConfig, fill_holes, fill_report
@@ -49,22 +48,6 @@ def test_patches_follow_the_volume_and_keep_the_mesh():
     assert Surface(bumpy(5)).closest(filled.vertices[len(holed.vertices):]).distances.max() < 0.004
 
 
-def test_diffusion_moves_along_with_the_mesh():
-    holed = pierced(bumpy(4), [0.1, 0, 0], 0.05)
-    R, t = rotations.exp(np.array([0.4, -1.1, 0.3])), np.array([0.2, -3.0, 1.0])
-    config = FillConfig(method="diffusion")
-    moved = fill_holes(holed.with_vertices(holed.vertices @ R.T + t), config)
-    assert Surface(fill_holes(holed, config)).closest((moved.vertices - t) @ R).distances.max() < 0.002
-
-
-def test_lines_of_sight_measure_how_far_space_is_empty():
-    shape = ball(4)
-    seen = SeenSpace([view(shape, [1, 0, 0])])
-    ahead = seen.ahead(np.array([[0.15, 0, 0], [0.1, 0, 0], [0.05, 0, 0], [0, 0.2, 0]]))
-    assert np.abs(ahead[:3] - [0.05, 0, -0.05]).max() < 0.001
-    assert ahead[3] == -np.inf                                  # nothing was seen behind it
-
-
 def test_what_was_seen_to_be_empty_is_outside():
     """Within a ball whose hole was looked into, which without that would be continued over it."""
     class Pit:
@@ -91,14 +74,6 @@ def test_seen_space_stays_empty():
     assert told.holes[0].in_empty < 0.1
     assert told.holes[0].method == "diffusion"
     assert after < 0.6 * before
-
-
-def test_finer_voxels_find_the_same_surface():
-    holed = pierced(ball(5), [0, 0, 0.1], 0.05)
-    coarse, fine = (diffuse_surface(holed, holed.boundary_vertices, voxels=n) for n in (10, 14))
-    inner = fine.vertices[np.linalg.norm(fine.vertices - [0, 0, 0.1], axis=1) < 0.05]
-    assert Surface(coarse).closest(inner).distances.max() < 0.004
-    assert len(fine.faces) > 1.5 * len(coarse.faces)
 
 
 @pytest.mark.parametrize("method", ["fair", "diffusion"])

@@ -6,7 +6,7 @@ from scipy.spatial import cKDTree
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.surface import Surface
 from scanprep.repair.handles import count_handles, cut_handles, find_short_loop, measure_loop
-from scanprep.surfaces.template import MadeTemplate, TemplateConfig, template_of_scan
+from scanprep.surfaces.template import MadeTemplate, template_of_scan
 from scanprep.synthetic.topology import load_topology
 
 
@@ -69,7 +69,7 @@ def test_fingers_joined_by_a_bridge_come_apart(joined):
 
 @pytest.mark.slow
 def test_a_template_tells_that_a_bridge_was_cut(joined):
-    made = template_of_scan(joined, config=TemplateConfig(thinnest=1e-6))
+    made = template_of_scan(joined, person=load_topology().mesh)
     assert any(note.startswith("1 bridge was cut") for note in made.notes) and not made.handles
 
 

@@ -1,9 +1,9 @@
 import numpy as np
 import pytest
-from scanned_shapes import ball, bumpy, triangle_quality
+from scanned_shapes import ball, bumpy
 
 from scanprep.geometry.mesh import Mesh, template_problem
-from scanprep.geometry.remeshing import flip_edges, improve_triangles, smooth_taubin
+from scanprep.geometry.remeshing import flip_edges, smooth_taubin
 from scanprep.geometry.surface import Surface
 from scanprep.repair.manifold import (
     drop_small_components,
@@ -107,31 +107,6 @@ def moebius(count=60):
     return Mesh(vertices, np.concatenate([np.stack([a, b, c], axis=1), np.stack([c, b, d], axis=1)]))
 
 
-def test_a_strip_with_one_side_is_cut_once():
-    strip = moebius()
-    assert not strip.is_edge_manifold and (strip.edge_use <= 2).all()
-    good = repair(strip)
-    assert template_problem(good) is None
-    assert len(good.faces) >= len(strip.faces) - 2
-
-
-def three_sheets():
-    """Three half planes that meet in a line, with a bow tie of two triangles at one end of it."""
-    line = np.stack([np.zeros(6), np.zeros(6), np.arange(6.0)], axis=1)
-    wings = [line + [np.cos(a), np.sin(a), 0] for a in (0, 2, 4)]
-    i = np.arange(5)
-    faces = [np.concatenate([np.stack([i, i + 1, s + i], axis=1), np.stack([i + 1, s + i + 1, s + i], axis=1)])
-             for s in (6, 12, 18)]
-    tie = np.array([[0, 0, -1], [1, 0, -1], [-1, 1, -1], [-1, 2, -2]], dtype=float)
-    return Mesh(np.concatenate([line, *wings, tie]), np.concatenate([*faces, [[0, 24, 25], [0, 26, 27]]]))
-
-
-def test_sheets_that_meet_in_a_line_are_parted():
-    good = repair(three_sheets(), min_component=0.0)
-    assert good.is_edge_manifold and good.is_vertex_manifold
-    assert len(good.faces) >= 20                                       # two of the three sheets and the tie
-
-
 @pytest.mark.parametrize("seed", range(6))
 def test_whatever_comes_in_comes_out_manifold(seed):
     """Shared and doubled vertices, needles, folds, strays and turned triangles all at once."""
@@ -185,18 +160,6 @@ def test_turned_edges_of_a_plane_are_delaunay():
         assert np.linalg.norm(points - centre, axis=1).min() > radius * (1 - 1e-2)
 
 
-def test_triangles_get_better_on_the_same_surface():
-    rng = np.random.default_rng(2)
-    exact = bumpy(4)
-    poor = exact.with_vertices(exact.vertices + 0.3 * exact.mean_edge * rng.normal(size=exact.vertices.shape))
-    poor = poor.with_vertices(Surface(exact).closest(poor.vertices).points)
-    better = improve_triangles(poor, Surface(exact))
-    assert np.percentile(triangle_quality(better), 1) > 0.6 > 2 * np.percentile(triangle_quality(poor), 1)
-    assert template_problem(better) is None and better.is_closed
-    assert Surface(exact).closest(better.vertices).distances.max() < 0.02 * exact.mean_edge
-    assert better.volume == pytest.approx(exact.volume, rel=0.01)
-
-
 def test_smoothing_takes_noise_off_and_keeps_the_size():
     rng = np.random.default_rng(3)
     exact = ball(4)
@@ -205,8 +168,3 @@ def test_smoothing_takes_noise_off_and_keeps_the_size():
     off = np.linalg.norm(even.vertices, axis=1) - 0.1
     assert off.std() < 0.4 * 0.001
     assert abs(off.mean()) < 2e-4
-
-
-def test_quality_of_known_triangles():
-    mesh = Mesh(np.array([[0, 0, 0], [1, 0, 0], [0.5, 3 ** 0.5 / 2, 0], [2, 0, 0]]), [[0, 1, 2], [0, 1, 3]])
-    assert triangle_quality(mesh) == pytest.approx([1, 0])

@@ -5,7 +5,7 @@ from animal_bodies import Animal, Build
 
 from scanprep.geometry import rotations
 from scanprep.geometry.mesh import Mesh
-from scanprep.skeleton.edit import merge_parts, split_part
+from scanprep.skeleton.edit import merge_parts
 from scanprep.skeleton.names import name_parts, note_numbered_parts
 from scanprep.skeleton.roles import find_roles, in_words, joint_in_words, limb_parts, missing_joints, part_name
 from scanprep.skeleton.symmetry import find_symmetry
@@ -96,8 +96,14 @@ def test_coarser_and_finer_trees_are_named(person):
     assert names(two) == whole - {"abdomen"}
     one = merge_parts(two, mesh, "pelvis", "chest")
     assert names(one) == whole - {"pelvis", "abdomen", "chest"} | {"trunk"}
-    three = split_part(person.skeleton, mesh, "abdomen")
-    assert names(three) == whole - {"abdomen"} | {"abdomen1", "abdomen2"}
+    # the upper half of the abdomen as a part of its own, number 2
+    height, part = mesh.corners[..., 2].mean(axis=1), person.part_of_face
+    upper = (part == 1) & (height > np.median(height[part == 1]))
+    parents = np.insert(person.parents + (person.parents >= 2), 2, 1)
+    parents[3] = 2
+    cut = Skeleton(np.where(upper, 2, part + (part >= 2)), parents,
+                   np.insert(person.joints, 2, mesh.corners[upper].mean(axis=(0, 1)), axis=0))
+    assert names(cut) == whole - {"abdomen"} | {"abdomen1", "abdomen2"}
     stumps = merge_parts(merge_parts(person.skeleton, mesh, "forearm_left", "hand_left"), mesh,
                          "forearm_right", "hand_right")
     assert names(stumps) == whole - {"hand_left", "hand_right"}

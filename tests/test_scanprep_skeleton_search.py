@@ -10,7 +10,7 @@ from scanprep.geometry.mesh import Mesh
 from scanprep.skeleton.find import search_skeleton
 from scanprep.skeleton.joints import dissolve_bands, passages, to_tree, without_weak
 from scanprep.skeleton.labels import label_patches
-from scanprep.skeleton.motions import PosedSurface, closure, fit_motions, rigid_costs
+from scanprep.skeleton.motions import PosedSurface, fit_motions, rigid_costs
 from scanprep.skeleton.names import part_partners
 from scanprep.skeleton.parts import PartSearch, SkeletonConfig
 from scanprep.skeleton.sides import Sides, cover, mirror_pairs
@@ -18,7 +18,7 @@ from scanprep.skeleton.symmetry import Symmetry, find_symmetry, mirror_poses
 from scanprep.synthetic.anatomy import MIRROR_PART
 from scanprep.synthetic.people import SyntheticPerson, mirror_synthetic_pose
 
-CONFIG = SkeletonConfig(restarts=1, patches=120, start=20)
+CONFIG = SkeletonConfig(restarts=1)
 
 
 @pytest.fixture(scope="module")
@@ -172,14 +172,6 @@ def test_borders_of_one_side_stand_for_those_of_both():
         assert (sides.relabel(costs, 1.0, split, partner) == wanted).all()
 
 
-def test_pairs_join_together():
-    partner = np.array([1, 0, 2, 4, 3, 5])
-    assert closure(0, 3, partner) == [[0, 3], [1, 4]]
-    assert closure(0, 1, partner) == [[0, 1]]
-    assert closure(2, 3, partner) == [[2, 3, 4]]
-    assert [sorted(s) for s in closure(2, 5, partner)] == [[2, 5]]
-
-
 def test_a_symmetric_animal_gets_its_twelve_symmetric_parts(animal, poses, found):
     skeleton, truth = found.skeleton, animal.skeleton
     assert found.symmetric and found.symmetry.holds and len(found.energies) == 1 and found.energies[0] > 0
@@ -227,16 +219,16 @@ def test_a_band_between_two_parts_is_no_part(animal, poses):
     assert passages(search, truth.part_of_face)[0].max() < 0.8
 
 
-def test_a_loop_is_opened_and_reported(animal, poses):
+def test_a_loop_is_opened(animal, poses):
     """The barrel cut into four quarters around its length: they close a loop, and become one."""
     surface, truth = PosedSurface(animal.mesh, poses), animal.skeleton
     search = PartSearch(surface, CONFIG)
     across = (animal.mesh.corners.mean(axis=1) @ ODD)[:, [1, 2]] > 0
     quarter = across @ [1, 2]
     label = np.where(truth.part_of_face == 0, np.where(quarter == 0, 0, quarter + 11), truth.part_of_face)
-    label, links, loops = to_tree(search, label)
-    assert loops and all(loop.length >= 3 for loop in loops) and any(loop.joined for loop in loops)
-    assert len(links) == label.max() and len(without_weak(search, label)) >= len(links)
+    count = label.max()
+    label, links = to_tree(search, label)
+    assert len(links) == label.max() < count and len(without_weak(search, label)) >= len(links)
 
 
 def test_costs_of_rigid_motions_without_the_motions():
@@ -250,9 +242,3 @@ def test_costs_of_rigid_motions_without_the_motions():
     np.testing.assert_allclose(rigid_costs(moments), exact, atol=1e-12 * moments.yy.max())
     rigid = PosedSurface(mesh, np.stack([mesh.vertices @ rotations.exp([0, 0, k]).T for k in range(3)]))
     assert rigid_costs(rigid.moments(np.zeros(len(mesh.faces), dtype=int)))[0] < 1e-14
-
-
-def test_bad_settings_of_the_search_are_refused_by_name():
-    for name, value in (("restarts", 0), ("start", 0), ("separation", -1.0)):
-        with pytest.raises(ValueError, match=name):
-            replace(CONFIG, **{name: value})

@@ -61,19 +61,6 @@ def test_rotations_are_chained_from_parent_to_child():
     np.testing.assert_array_equal(SKELETON.part_rotations(np.zeros((4, 3))), np.tile(np.eye(3), (4, 1, 1)))
 
 
-def test_turning_the_root_turns_every_part():
-    pose, turn = np.random.default_rng(1).uniform(-1, 1, (4, 3)), rotations.exp([0.3, -0.2, 0.5])
-    turned = pose.copy()
-    turned[0] = rotations.log(turn @ rotations.exp(pose[0]))
-    np.testing.assert_allclose(SKELETON.part_rotations(turned), turn @ SKELETON.part_rotations(pose), atol=1e-12)
-
-
-def test_joints_of_parts_and_descent():
-    assert SKELETON.joints_of_part == ((1, 3), (1, 2), (2,), (3,))
-    expected = [[1, 0, 0, 0], [1, 1, 0, 0], [1, 1, 1, 0], [1, 0, 0, 1]]
-    np.testing.assert_array_equal(SKELETON.descends, np.array(expected, dtype=bool))
-
-
 def test_the_ring_lies_between_a_part_and_its_parent():
     for j in (1, 2, 3):
         ring = SKELETON.ring(MESH, j)
@@ -104,13 +91,6 @@ def test_part_rotations_of_a_rigidly_moved_body_are_found():
     R = rotations.exp([0.4, 0.9, -0.7])
     found = SKELETON.fit_rotations(MESH, np.stack([MESH.vertices @ R.T + 3, MESH.vertices]))
     np.testing.assert_allclose(found, np.stack([np.tile(R, (4, 1, 1)), np.tile(np.eye(3), (4, 1, 1))]), atol=1e-9)
-
-
-def test_part_of_vertex_is_the_vote_of_its_triangles():
-    part = SKELETON.part_of_vertex(MESH)
-    for v in range(0, len(part), 7):
-        votes = np.bincount(PART[(MESH.faces == v).any(axis=1)], minlength=4)
-        assert part[v] == votes.argmax()
 
 
 def test_what_is_saved_comes_back(tmp_path):

@@ -20,9 +20,8 @@ from scanprep.registration.limbs import angle_excess, part_angles
 from scanprep.synthetic import people, topology
 from scanprep.synthetic.data_set import subject_pose
 from scanprep.synthetic.landmarks import landmarks
-from scanprep.synthetic.muscles import COLUMNS, masks
 from scanprep.synthetic.people import NAMED_POSES, PARENTS, PARTS, BodyShape, SyntheticPerson
-from scanprep.synthetic.population import STORED, population
+from scanprep.synthetic.population import population
 
 ROOT = Path(__file__).parents[1]
 RECIPE = ROOT / "tests" / "people"
@@ -56,11 +55,6 @@ def test_everybody_is_one_closed_outward_surface(bodies):
         assert mesh.volume > 0
         # MakeHuman's quads, pressed thin in the groin and between toes, where skin meets skin
         assert quality(mesh).min() > 1e-3 and np.percentile(quality(mesh), 1) > 0.25
-
-
-def test_all_have_one_topology_and_its_file_is_small(bodies):
-    assert all(np.array_equal(person.mesh.faces, topology.load_topology().mesh.faces) for person in bodies)
-    assert STORED.stat().st_size < 5e6
 
 
 def test_the_file_is_what_the_recipe_makes():
@@ -175,16 +169,6 @@ def test_parts_are_connected_and_form_the_tree(man):
     assert man.skeleton.joint_regressor(man.mesh) @ man.mesh.vertices == pytest.approx(man.joints, abs=1e-9)
 
 
-def test_same_vertex_is_the_same_place_on_everybody(bodies):
-    for person in bodies:
-        v, j = person.mesh.vertices, person.anatomy.joints
-        assert np.linalg.norm(v[people.LANDMARKS["nose tip"]] - v[people.LANDMARKS["chin"]]) < 0.09
-        assert v[people.LANDMARKS["top of head"], 2] == pytest.approx(v[:, 2].max(), abs=0.004)
-        for side, elbow in (("left", 5), ("right", 8)):
-            middle = 0.5 * (v[people.LANDMARKS[f"{side} elbow outside"]] + v[people.LANDMARKS[f"{side} elbow inside"]])
-            assert np.linalg.norm(middle - j[elbow]) < 0.03
-
-
 def test_random_shapes_differ_repeat_and_are_spread_as_their_sex():
     one, two = (BodyShape.random(np.random.default_rng(seed)) for seed in (3, 3))
     assert one == two and one != BodyShape.random(np.random.default_rng(4))
@@ -221,12 +205,6 @@ def test_turning_the_root_turns_the_body(man):
     assert np.abs(man.joints_in_pose(turned) - joints).max() < 1e-9
 
 
-def test_root_part_stays_centred(man):
-    for name in ("squat", "run"):
-        v = man.in_pose(people.find_pose(name))
-        assert np.abs(v[man.part_of_vertex == 0].mean(axis=0) - man.joints[0]).max() < 1e-9
-
-
 def test_parts_follow_their_rotations(man):
     """Away from the joints every part turns as the pose says."""
     for name in ("run", "point_right", "kick_left"):
@@ -235,39 +213,6 @@ def test_parts_follow_their_rotations(man):
         fitted = man.skeleton.fit_rotations(man.mesh, man.in_pose(pose))
         angle = np.degrees(np.linalg.norm(rotations.log(np.swapaxes(R, 1, 2) @ fitted), axis=1))
         assert np.median(angle) < 3 and angle.max() < 15, dict(zip(PARTS, angle.round(1), strict=True))
-
-
-def test_posing_is_not_linear_blend_skinning(man):
-    """What the best linear blend of the parts' rigid motions leaves over, vertex by vertex."""
-    poses = [people.find_pose(name) for name in NAMED_POSES]
-    posed = np.stack([man.in_pose(pose) for pose in poses])
-    affine = np.empty((len(poses), 16, 3, 4))
-    for k, pose in enumerate(poses):
-        R, place = man._poser.part_motion(pose)
-        affine[k] = np.concatenate([R, (place - np.einsum("pij,pj->pi", R, man.anatomy.joints)
-                                        + man._poser.settling(pose))[..., None]], axis=2)
-    rest = np.hstack([man.mesh.vertices, np.ones((len(man.mesh.vertices), 1))])
-    residual = np.empty(len(rest))
-    for v in range(0, len(rest), 60):
-        basis = np.einsum("kpij,j->kip", affine, rest[v]).reshape(-1, 16)
-        weights = np.linalg.lstsq(basis, posed[:, v].reshape(-1), rcond=1e-6)[0]
-        residual[v] = np.sqrt(np.mean((basis @ weights - posed[:, v].reshape(-1))**2) * 3)
-    sampled, areas = residual[::60], man.mesh.vertex_areas[::60]             # hands and heads have most vertices
-    assert np.average(sampled, weights=areas) > 0.0015 and np.percentile(sampled, 90) > 0.003
-
-
-def test_muscles_bulge_with_strength():
-    """A bent elbow raises the biceps in the frame of the upper arm, more on a man."""
-    bent = people.compose_pose(left_arm={"elbow": 95})
-    rises = []
-    for sex in ("female", "male"):
-        person = SyntheticPerson(BodyShape(sex, tuple(population().moments["male"][0])))
-        biceps = masks()[:, COLUMNS["biceps", "l"]].argmax()
-        rest = person.mesh.vertices[biceps] - person.joints[4]
-        R = person.part_rotations(bent)[4]
-        moved = R.T @ (person.in_pose(bent)[biceps] - person.joints_in_pose(bent)[4])
-        rises.append((moved - rest) @ person.mesh.vertex_normals[biceps])
-    assert 0.004 < rises[0] < 0.02 and rises[1] > rises[0] + 0.002
 
 
 def test_raised_arms_raise_the_shoulders(man):
@@ -299,10 +244,9 @@ def test_poses_are_many_and_unknown_ones_refused():
         SyntheticPerson().in_pose(np.zeros((15, 3)))
 
 
-def test_random_poses_are_repeatable_varied_and_scale_with_spread():
+def test_random_poses_are_repeatable_and_varied():
     drawn = np.stack([people.random_pose(np.random.default_rng(seed)) for seed in range(40)])
     assert np.array_equal(drawn[7], people.random_pose(np.random.default_rng(7)))
-    assert np.allclose(people.random_pose(np.random.default_rng(7), spread=0.0), 0)
     assert drawn[:, 1:].std(axis=0).max() > 0.4
     assert np.degrees(np.linalg.norm(drawn, axis=2)).max() < 178
 

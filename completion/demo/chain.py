@@ -28,7 +28,7 @@ from scanprep.geometry.surface import Surface, SurfacePoints
 from scanprep.pipeline.again import Call
 from scanprep.pipeline.prepare import SCANS, Prepared, prepare
 from scanprep.pipeline.scans import TABLE, find_scans
-from scanprep.surfaces.template import TemplateConfig, template_of_views
+from scanprep.surfaces.template import template_of_views
 from scanprep.synthetic.data_set import (
     SUBJECT,
     GroundTruth,
@@ -134,8 +134,6 @@ class Demo:
         """The template: a careful scan of the subject at rest from many sides, merged, holes filled, decimated."""
         # twelve views also from above and below, and deep into narrow places, so that hands get fingers
         scanner = ScannerConfig(views=12, resolution=self.amounts.template_resolution, height=1.2, blind_reach=0.01)
-        settings = TemplateConfig()
-        settings = replace(settings, merge=replace(settings.merge, voxel=self.amounts.template_resolution))
 
         def make(folder: Path) -> None:
             """Scan the subject, merge the views and write the template."""
@@ -146,12 +144,12 @@ class Demo:
                 place = folder / "template_scan"
                 write_scan(place, "rest", careful, self.rest, marks)
                 views = read_views(place / "views" / "rest.npz")
-                mesh = template_of_views(views, self.amounts.faces, settings, progress)
+                mesh = template_of_views(views, self.amounts.faces, progress, self.amounts.template_resolution)
             landmarks = read_landmark_vertices(place / "rest.landmarks.json", mesh)
             write_landmarks(folder / "template.landmarks.json", landmarks)
             write_mesh(folder / "template.ply", mesh)
 
-        self.space.step("template", (self.seed, self.amounts.faces, scanner, settings), make)
+        self.space.step("template", (self.seed, self.amounts.faces, scanner), make)
         return read_mesh(self.folder / "template.ply")
 
     @cached_property

@@ -7,30 +7,10 @@ from typing import Any
 import numpy as np
 
 from ..geometry.mesh import Mesh
-from ..geometry.surface import Surface
 
 
 class MissingLibraryError(ImportError):
     """A library that a setting asks for, or a system library it needs, is missing."""
-
-
-def open3d_decimation(mesh: Mesh, faces: int) -> Mesh:
-    """Decimate by Open3D's quadric error collapses."""
-    o3d = library("open3d")
-    # copies, as Open3D needs arrays of its own
-    whole = o3d.geometry.TriangleMesh(o3d.utility.Vector3dVector(np.array(mesh.vertices)),
-                                      o3d.utility.Vector3iVector(mesh.faces.astype(np.int32)))
-    smaller = whole.simplify_quadric_decimation(faces)
-    return Mesh(np.asarray(smaller.vertices), np.asarray(smaller.triangles))
-
-
-def open3d_poisson(mesh: Mesh, depth: int = 8) -> Mesh:
-    """Reconstruct a closed surface from vertices and normals by screened Poisson reconstruction."""
-    o3d = library("open3d")
-    cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(np.array(mesh.vertices)))
-    cloud.normals = o3d.utility.Vector3dVector(np.array(mesh.vertex_normals))
-    closed, _ = o3d.geometry.TriangleMesh.create_from_point_cloud_poisson(cloud, depth=depth, n_threads=1)
-    return recolor(Mesh(np.asarray(closed.vertices), np.asarray(closed.triangles)), mesh)
 
 
 def estimate_oriented_normals(points: np.ndarray) -> np.ndarray:
@@ -64,16 +44,8 @@ def ball_pivoting(points: np.ndarray, normals: np.ndarray, spacing: float) -> Me
     return Mesh(np.asarray(found.vertices), np.asarray(found.triangles).astype(np.int64))
 
 
-def recolor(mesh: Mesh, source: Mesh) -> Mesh:
-    """Colour a mesh by the closest points of another one, if that has colours."""
-    if source.colors is None:
-        return mesh
-    at = Surface(source).closest(mesh.vertices)
-    return Mesh(mesh.vertices, mesh.faces, np.clip(at.transfer(source.colors, source.faces), 0, 1))
-
-
 def library(name: str) -> Any:
-    """Import open3d or pymeshlab; MissingLibrary with advice if that fails."""
+    """Import open3d; MissingLibrary with advice if that fails."""
     try:
         return importlib.import_module(name)
     except (ImportError, OSError) as error:

@@ -12,7 +12,7 @@ from ..geometry.surface import check_points
 from ..geometry.target import target_of
 from ..judgement import extent
 from ..plausible import unit_problem
-from ..ranges import Positive, Settings, SomeShare
+from ..ranges import Settings, SomeShare
 from ..threads import search_threads
 
 LEAST = 6                   # fewest matches: as many as a rigid motion has unknowns
@@ -26,17 +26,14 @@ class RigidConfig(Settings):
     ----------
     keep : float
         Share of the matches that count, the nearest ones.
-    reach : float, metres, optional
-        Largest distance of a match.
 
     Examples
     --------
-    >>> RigidConfig(keep=0.5, reach=0.05).keep
+    >>> RigidConfig(keep=0.5).keep
     0.5
     """
 
     keep: SomeShare = 0.8
-    reach: Positive | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -118,7 +115,6 @@ def align_rigid(source: Mesh | np.ndarray, target: Mesh | np.ndarray,
     True
     """
     config = config or RigidConfig()
-    reach = np.inf if config.reach is None else config.reach
     moving = check_points(source.vertices if isinstance(source, Mesh) else source, "source")
     if not len(moving):
         raise ValueError("source: expected points, got none")
@@ -133,7 +129,7 @@ def align_rigid(source: Mesh | np.ndarray, target: Mesh | np.ndarray,
     while rounds < 60 and not settled:
         moved = apply(T, moving)
         distance, near = tree.query(moved, workers=search_threads(len(moved)))
-        good = (distance <= reach) & (distance <= np.quantile(distance, config.keep)) & ~goal.border[near]
+        good = (distance <= np.quantile(distance, config.keep)) & ~goal.border[near]
         inliers = int(good.sum())
         if inliers < LEAST:
             break

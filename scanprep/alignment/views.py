@@ -12,8 +12,12 @@ from ..geometry import rotations
 from ..geometry.mesh import Mesh
 from ..geometry.remeshing import smooth_taubin
 from ..geometry.surface import OrientedPoints, mesh_and_camera
-from ..ranges import Count, Positive, Settings, Share
+from ..ranges import Positive, Settings, Share
 from .view_poses import fit_of_views, place_by_features, place_by_landmarks
+
+ROUNDS = 60                   # of matching, at most: views that still move then are not trusted
+BORDER = 0.02                 # metres: points nearer to the border of their view are not matched, as edges are noisy
+CONFLICT = 0.03               # share of a view that others look through; with more, its pose is not trusted
 
 
 @dataclass(frozen=True)
@@ -22,23 +26,14 @@ class AlignViewsConfig(Settings):
 
     Attributes
     ----------
-    iterations : int
-        Largest number of matching rounds.
     reach : float, metres
         Largest distance of a match in the first round; later rounds allow three times the median distance.
-    border : float, metres
-        Points nearer than this to the border of their view are not matched.
     min_overlap : float
         Least share of a view that others also saw; with less, its pose is not trusted.
-    max_conflict : float
-        Largest share of a view that may violate free space of others; with more, its pose is not trusted.
     """
 
-    iterations: Count = 60
     reach: Positive = 0.08
-    border: float = 0.02
     min_overlap: Share = 0.15
-    max_conflict: Share = 0.03
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,7 +41,6 @@ class AlignedViews:
     """Views after `align_views`."""
 
     views: list[tuple[Mesh, np.ndarray]]     # moved surfaces and camera positions, ready for `merge_views`
-    T_world_view: np.ndarray                 # (V, 4, 4) the motion of each view; the first one stays
     rms: float                               # metres, RMS point-to-plane distance of the matches at the end
     converged: bool
     iterations: int
@@ -56,16 +50,14 @@ class AlignedViews:
 
 
 def align_views(views: Sequence[Any], config: AlignViewsConfig | None = None,
-                rng: np.random.Generator | None = None,
                 landmarks: Sequence[Mapping[str, np.ndarray]] | None = None, features: bool = False) -> AlignedViews:
     """Refine rough camera poses by point-to-plane matching between all pairs of views together.
 
     `views` are RangeViews, or pairs of a Mesh and a camera position (3,), within a few centimetres and degrees of their
     true poses. Larger errors need `landmarks` (per view one mapping name -> (3,) point, each name in at least two
-    views) or `features` (shape alone) to place them first. `rng` draws the points that are matched. ValueError for no
-    views.
+    views) or `features` (shape alone) to place them first. ValueError for no views.
     """
-    config, rng = config or AlignViewsConfig(), rng or np.random.default_rng(0)
+    config, rng = config or AlignViewsConfig(), np.random.default_rng(0)
     pairs = [mesh_and_camera(view) for view in views]
     if not pairs:
         raise ValueError("views: expected at least one, got none")
@@ -77,10 +69,10 @@ def align_views(views: Sequence[Any], config: AlignViewsConfig | None = None,
         start = place_by_features(pairs, rng)
     pairs = [_move(pair, T) for pair, T in zip(pairs, start, strict=True)]
     # ICP over all pairs: match, solve for all motions together, tighten the reach
-    samples = [_sample(mesh, config, rng) for mesh, _ in pairs]
+    samples = [_sample(mesh, rng) for mesh, _ in pairs]
     poses = np.tile(np.eye(4), (len(pairs), 1, 1))
     reach, rms, settled, rounds = config.reach, np.nan, len(pairs) == 1, 0
-    while rounds < config.iterations and not settled:
+    while rounds < ROUNDS and not settled:
         placed = [(p @ T[:3, :3].T + T[:3, 3], n @ T[:3, :3].T)
                   for T, (p, n, _) in zip(poses, samples, strict=True)]
         matches = _match(placed, [inner for _, _, inner in samples], reach)
@@ -96,8 +88,8 @@ def align_views(views: Sequence[Any], config: AlignViewsConfig | None = None,
         reach = min(reach, max(3 * float(np.median(distances)), 0.005))
     out = [_move(pair, T) for pair, T in zip(pairs, poses, strict=True)]
     overlap, conflict = fit_of_views(out)
-    trusted = settled & (overlap >= config.min_overlap) & (conflict <= config.max_conflict) | (len(out) == 1)
-    return AlignedViews(out, poses @ start, rms, settled, rounds, overlap, conflict, trusted)
+    trusted = settled & (overlap >= config.min_overlap) & (conflict <= CONFLICT) | (len(out) == 1)
+    return AlignedViews(out, rms, settled, rounds, overlap, conflict, trusted)
 
 
 def _move(view: tuple[Mesh, np.ndarray], T: np.ndarray) -> tuple[Mesh, np.ndarray]:
@@ -106,11 +98,10 @@ def _move(view: tuple[Mesh, np.ndarray], T: np.ndarray) -> tuple[Mesh, np.ndarra
     return mesh.with_vertices(mesh.vertices @ T[:3, :3].T + T[:3, 3]), T[:3, :3] @ camera + T[:3, 3]
 
 
-def _sample(mesh: Mesh, config: AlignViewsConfig, rng: np.random.Generator
-              ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _sample(mesh: Mesh, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Draw at most 16,000 points of a smoothed view, their normals, and which lie well inside its border."""
     even = smooth_taubin(mesh, 10)
-    inner = border_distance(mesh, config.border) >= config.border
+    inner = border_distance(mesh, BORDER) >= BORDER
     chosen = rng.permutation(len(mesh.vertices))[:16_000]
     return even.vertices[chosen], even.vertex_normals[chosen], inner[chosen]
 

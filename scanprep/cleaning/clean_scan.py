@@ -17,6 +17,8 @@ from .floor import Plane, find_plane, floor_points
 
 LARGEST, LANDMARKS, NEAR = "the largest piece", "the piece with the landmarks", "near the body"
 MUTUAL, SPARSE = 6, 3.0              # neighbours linked in sparse regions, and their largest distance in links
+SPECK = 30                           # pieces with fewer points are specks: a scanned floor leaves hundreds
+LINKED = 3.0                         # points closer than so many median spacings are linked, across lost rays
 FLAT = 0.02                          # share of the points that a plane has which stays; both soles have 0.01
 FAR, SPECKS, FLOOR = "apart from the body", "specks", "a plane with all on one side, and what is below it"
 
@@ -30,14 +32,10 @@ class CleanScanConfig(Settings):
     gap : float, metres
         Pieces closer than this to the body, or to a piece that belongs to it, belong to it: hands and feet that the
         scanner saw separately. In a coarse scan at least five times its spacing.
-    min_points : int
-        Smaller pieces are specks.
     planes : int
         Largest number of floors and walls that are removed.
     floor_area : float, square metres
         A plane with less measured area is no floor; both soles together have about 0.04.
-    spacings : float
-        Points closer than this many median spacings are linked.
     up : 'x', '-x', 'y', '-y', 'z' or '-z', optional
         The axis of the scan that points up, where it is known: then only floors are taken off, and no walls.
 
@@ -48,10 +46,8 @@ class CleanScanConfig(Settings):
     """
 
     gap: float = 0.03
-    min_points: int = 30
     planes: int = 3
     floor_area: float = 0.1
-    spacings: float = 3.0
     up: Annotated[Axis | None, FLAG] = None
 
 
@@ -60,9 +56,7 @@ class Component:
     """One piece of a scan."""
 
     points: int
-    area: float                 # of its triangles, square metres; NaN in a point cloud
     size: tuple[float, ...]     # extent along the axes, metres
-    gap: float                  # to the body, metres; 0 for the body itself
     kept: bool
     reason: str                 # why it was kept or dropped
 
@@ -124,8 +118,8 @@ def take_clutter(scan: Mesh | np.ndarray) -> tuple[Mesh | np.ndarray, float]:
 
 
 @take_any_mesh
-def clean_scan(scan: Mesh | np.ndarray, config: CleanScanConfig | None = None, landmarks: np.ndarray | None = None,
-               rng: np.random.Generator | None = None) -> CleanedScan:
+def clean_scan(scan: Mesh | np.ndarray, config: CleanScanConfig | None = None, landmarks: np.ndarray | None = None
+               ) -> CleanedScan:
     """Keep the body of a raw scan and drop the floor, walls, furniture and specks.
 
     A floor is a large plane with everything else on one side. Points within its noise belong to the body inside the
@@ -140,8 +134,6 @@ def clean_scan(scan: Mesh | np.ndarray, config: CleanScanConfig | None = None, l
         Settings.
     landmarks : (L, 3) float, metres, optional
         Points on the body, to choose its piece; by default the largest piece is the body.
-    rng : numpy.random.Generator, optional
-        Draws the points where planes are tried.
 
     Returns
     -------
@@ -160,42 +152,41 @@ def clean_scan(scan: Mesh | np.ndarray, config: CleanScanConfig | None = None, l
     >>> bool(cleaned.kept[-1])
     False
     """
-    config, rng = config or CleanScanConfig(), rng or np.random.default_rng(0)
+    config, rng = config or CleanScanConfig(), np.random.default_rng(0)
     scan = sanitise(scan) if isinstance(scan, Mesh) else scan
     mesh = _as_mesh(scan)
     points = mesh.vertices
     if not len(points):
         raise ValueError("scan: expected points, got none")
     step = spacing(points)
-    link = max(0.012, config.spacings * step)                       # at least 12 mm, about the spacing of a coarse scan
+    link = max(0.012, LINKED * step)                       # at least 12 mm, about the spacing of a coarse scan
     # planes first; then the pieces of the rest, and which of them is the body
     label, planes, flat = _without_planes(mesh, link, config, landmarks, rng)
     rest = np.flatnonzero(label < 0)
     if not len(rest):
         raise ValueError("scan: nothing is left when planes are taken off; expected a body in front of them")
     piece = label_pieces(mesh, rest, link)
-    main, why = _body_of(points[rest], piece, config, landmarks)
+    main, why = _body_of(points[rest], piece, landmarks)
     # report all specks in one row: a scanned floor leaves hundreds
     size = np.bincount(piece)
-    large = np.flatnonzero((size >= config.min_points) | (np.arange(len(size)) == main))
+    large = np.flatnonzero((size >= SPECK) | (np.arange(len(size)) == main))
     row_of = np.full(len(size), len(large))
     row_of[large] = np.arange(len(large))
     label[rest] = len(planes) + row_of[piece]
-    body = cKDTree(points[rest[piece == main]])
     # five spacings: steps of a depth camera on an oblique surface
     near = _near_pieces([points[rest[piece == number]] for number in large], int(np.flatnonzero(large == main)[0]),
                         max(config.gap, 5.0 * step))
-    # one row per plane, per piece, and for all specks: reason, gap to the body, kept or not
+    # one row per plane, per piece, and for all specks: reason, kept or not
     rows = []
     for number in range(int(label.max()) + 1):
         own = label == number
         old = number - len(planes) if len(planes) <= number < len(planes) + len(large) else None
         reason = (FLOOR if number < len(planes) else SPECKS if old is None else why if large[old] == main
                   else NEAR if near[old] else FAR)
-        gap = 0.0 if reason == why else _gap(body, points[own])
-        rows.append(_component(mesh, own, gap, reason in (why, NEAR), reason))
+        extent = tuple(np.ptp(points[own], axis=0).tolist()) if own.any() else (0.0, 0.0, 0.0)
+        rows.append(Component(int(own.sum()), extent, reason in (why, NEAR), reason))
     kept = np.array([row.kept for row in rows])[label]
-    floor = next((p for p in planes if p.height(body.data).min() <= config.gap), None)
+    floor = next((p for p in planes if p.height(points[rest[piece == main]]).min() <= config.gap), None)
     return CleanedScan(select_points(scan, kept), kept, label, tuple(rows), floor, flat)
 
 
@@ -213,7 +204,7 @@ def _without_planes(mesh: Mesh, link: float, config: CleanScanConfig, landmarks:
     points, planes, kept, own = mesh.vertices, list[Plane](), list[Plane](), list[Plane]()
     label = np.full(len(points), -1)
     most = 2 * config.planes        # of those that stay: a box-shaped head has six
-    while len(planes) < config.planes and len(kept) + len(own) <= most and (label < 0).sum() > config.min_points:
+    while len(planes) < config.planes and len(kept) + len(own) <= most and (label < 0).sum() > SPECK:
         rest = np.flatnonzero(label < 0)
         plane = find_plane(points[rest], config.floor_area, rng,
                            None if config.up is None else np.array(direction_of(config.up)), [*kept, *own])
@@ -222,7 +213,7 @@ def _without_planes(mesh: Mesh, link: float, config: CleanScanConfig, landmarks:
         # the body stands on the plane; its footprint is not removed
         standing = rest[plane.height(points[rest]) > plane.thickness]
         piece = label_pieces(mesh, standing, link)
-        body = standing[piece == _body_of(points[standing], piece, config, landmarks)[0]] if len(standing) else standing
+        body = standing[piece == _body_of(points[standing], piece, landmarks)[0]] if len(standing) else standing
         off = rest[floor_points(points[rest], plane, points[body])]
         if _is_face_of_body(mesh, off):
             own.append(plane)
@@ -289,12 +280,11 @@ def _sparse_links(points: np.ndarray, link: float, longest: float) -> np.ndarray
     return np.stack([a, b], axis=1)[np.isin(a * len(points) + b, b * len(points) + a)]
 
 
-def _body_of(points: np.ndarray, piece: np.ndarray, config: CleanScanConfig, landmarks: np.ndarray | None
-             ) -> tuple[int, str]:
+def _body_of(points: np.ndarray, piece: np.ndarray, landmarks: np.ndarray | None) -> tuple[int, str]:
     """Choose the piece that is the body, and say why: by landmarks, else the largest."""
     if landmarks is None:
         return 0, LARGEST
-    large = np.bincount(piece)[piece] >= config.min_points
+    large = np.bincount(piece)[piece] >= SPECK
     if not large.any():
         large = np.ones(len(piece), dtype=bool)
     marked = piece[large][cKDTree(points[large]).query(np.reshape(landmarks, (-1, 3)))[1]]
@@ -316,11 +306,3 @@ def _gap(body: cKDTree, points: np.ndarray) -> float:
     """Return the smallest distance; some points first, because distant queries are slow without a bound."""
     bound = float(body.query(points[::max(len(points) // 300, 1)])[0].min())
     return min(bound, float(body.query(points, distance_upper_bound=bound + 1e-12)[0].min()))
-
-
-def _component(mesh: Mesh, own: np.ndarray, gap: float, kept: bool, reason: str) -> Component:
-    """Describe one piece for the report."""
-    points = mesh.vertices[own]
-    area = float(mesh.face_areas[own[mesh.faces].all(axis=1)].sum()) if len(mesh.faces) else float("nan")
-    size = tuple(np.ptp(points, axis=0).tolist()) if len(points) else (0.0, 0.0, 0.0)
-    return Component(len(points), area, size, gap, kept, reason)

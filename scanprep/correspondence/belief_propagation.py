@@ -31,11 +31,10 @@ class Beliefs:
     converged: bool
 
 
-def propagate(field: PairField, iterations: int = 40, damping: float = 0.3, tolerance: float = 1e-3) -> Beliefs:
+def propagate(field: PairField, iterations: int, tolerance: float = 1e-3) -> Beliefs:
     """Compute beliefs by loopy belief propagation with parallel updates; exact on a tree.
 
-    A share `damping` of the old message is kept. It has converged when the mean message changes by less than the
-    tolerance.
+    It has converged when the mean message changes by less than the tolerance.
 
     [CC] loopy belief propagation
     """
@@ -45,6 +44,7 @@ def propagate(field: PairField, iterations: int = 40, damping: float = 0.3, tole
     onward = np.exp(-np.ascontiguousarray(field.pairwise.transpose(0, 2, 1), dtype=np.float32))
     return_ = np.exp(-np.ascontiguousarray(field.pairwise, dtype=np.float32))
     done, change = 0, np.inf
+    damping = 0.3                    # share of the old message that is kept, or messages on loops would swing
     while done < iterations and change > tolerance:
         # each variable sends its belief, without what the receiver itself has sent
         belief = _gather(field, forth, back)

@@ -23,11 +23,13 @@ from ..geometry.mesh import Mesh, check_template, take_any_mesh
 from ..geometry.target import target_of
 from ..threads import one_thread
 from .correspondences import Correspondences, check_pairs
-from .search import BeliefLevel, CorrelatedConfig, Seeds, propagate_beliefs, result, surfaces_of
+from .search import LEVELS, CorrelatedConfig, Seeds, propagate_beliefs, result, surfaces_of
 from .sheet import Sheet
 
-# cheap settings to test a hypothesis: fewer points and one coarse level are enough to rank hypotheses
-TRIAL = CorrelatedConfig(points=90, levels=(BeliefLevel(900, 60),), iterations=25)
+# To rank hypotheses, fewer points, candidates and rounds of messages are enough, at one level.
+TRIAL_POINTS, TRIAL_PLACES, TRIAL_CHOICES, TRIAL_ROUNDS = 90, 900, 60, 25
+ENDS = 5                             # head, hands and feet
+HYPOTHESES = 8                       # that are tested, the best by path lengths; each costs a trial
 
 
 @take_any_mesh
@@ -64,13 +66,11 @@ def find_correspondences(template: Mesh, scan: Mesh | np.ndarray, seeds: tuple[n
 
     Examples
     --------
-    >>> from scanprep.correspondence.search import BeliefLevel
     >>> from scanprep.synthetic.people import SyntheticPerson, find_pose
     >>> person = SyntheticPerson()
     >>> scan = person.in_pose(find_pose("run"))
     >>> seeds = np.arange(0, len(scan), len(scan) // 9)
-    >>> config = CorrelatedConfig(points=60, levels=(BeliefLevel(500, 30),))
-    >>> found = find_correspondences(person.mesh, scan, (seeds, scan[seeds]), config)
+    >>> found = find_correspondences(person.mesh, scan, (seeds, scan[seeds]), CorrelatedConfig(points=60))
     >>> found.scan_points.shape == (len(found), 3)
     True
 
@@ -83,41 +83,41 @@ def find_correspondences(template: Mesh, scan: Mesh | np.ndarray, seeds: tuple[n
         seeds = (ends.template_vertices, ends.scan_points)
     vertices, places = check_pairs(template, *seeds, "seeds")
     # one graph over the scan; distances from every seed on both surfaces
-    total = 2 + 2 * len(config.levels)
+    total = 2 + 2 * len(LEVELS)
     sheet = Sheet(target_of(scan), config.spacing * float(np.sqrt(template.face_areas.sum())))
     points = sheet.at(places)
     known = Seeds(vertices, places, points, _surface(template).distances(vertices), sheet.distances(points))
     # features of both surfaces; then belief propagation, coarse to fine
-    surfaces, images = surfaces_of(template, sheet, known, config), None
+    surfaces, images = surfaces_of(template, sheet, known, config.points), None
     report_progress(2, total)
-    for number, level in enumerate(config.levels):
-        surfaces, images = propagate_beliefs(surfaces, images, level, config)
+    for number, (count, choices) in enumerate(LEVELS):
+        surfaces, images = propagate_beliefs(surfaces, images, count, choices)
         report_progress(4 + 2 * number, total)
-    assert images is not None, "levels: expected at least one"
-    return result(surfaces, images, config)
+    assert images is not None, "there is a level"
+    return result(surfaces, images)
 
 
 @one_thread()
-def find_seeds(template: Mesh, scan: Mesh | np.ndarray, ends: int = 5, hypotheses: int = 8) -> Correspondences:
+def find_seeds(template: Mesh, scan: Mesh | np.ndarray) -> Correspondences:
     """Detect and match the ends of the limbs of template and scan, without any landmark.
 
     Ends are local maxima of the mean distance along the surface: head, hands and feet of a person whose limbs do not
-    touch. At most `ends` are used on the template, and two more on the scan. They are matched by the path lengths
-    between them. To tell left from right and front from back, the best `hypotheses` are tested by belief propagation:
+    touch. At most five are used on the template, and two more on the scan. They are matched by the path lengths
+    between them. To tell left from right and front from back, the best hypotheses are tested by belief propagation:
     the right one keeps orientation and short edges. No axis is assumed to be up. The confidence says how much worse the
     second best hypothesis is. ValueError where either surface has fewer than three ends.
     """
     check_template(template)
     size = float(np.sqrt(template.face_areas.sum()))
     apart = 0.28  # in sizes: an end is the maximum within this distance along the surface, 40 cm on a man
-    template_ends, template_paths = _template_ends(template, ends, apart * size)
+    template_ends, template_paths = _template_ends(template, ENDS, apart * size)
     if len(template_ends) < 3:
         raise ValueError(f"template: expected at least three limbs, found {len(template_ends)} ends")
-    sheet = Sheet(target_of(scan), TRIAL.spacing * size)
-    scan_ends, scan_paths = find_path_ends(sheet.points, sheet.distances, ends + 2, apart * size)
+    sheet = Sheet(target_of(scan), CorrelatedConfig().spacing * size)
+    scan_ends, scan_paths = find_path_ends(sheet.points, sheet.distances, ENDS + 2, apart * size)
     if len(scan_ends) < 3:
         raise ValueError(f"scan: expected at least three ends of limbs, found {len(scan_ends)}")
-    matches = match_ends(template_paths[:, template_ends], scan_paths[:, scan_ends], hypotheses)
+    matches = match_ends(template_paths[:, template_ends], scan_paths[:, scan_ends], HYPOTHESES)
     # test each hypothesis: energy per point of a coarse belief propagation, plus 2 for every unmatched end
     trials = []
     for image in matches:
@@ -125,7 +125,8 @@ def find_seeds(template: Mesh, scan: Mesh | np.ndarray, ends: int = 5, hypothese
         at = image[matched]
         seeds = Seeds(template_ends[matched], sheet.points[scan_ends[at]], scan_ends[at], template_paths[matched],
                       scan_paths[at])
-        surfaces, images = propagate_beliefs(surfaces_of(template, sheet, seeds, TRIAL), None, TRIAL.levels[0], TRIAL)
+        surfaces = surfaces_of(template, sheet, seeds, TRIAL_POINTS, TRIAL_PLACES)
+        surfaces, images = propagate_beliefs(surfaces, None, TRIAL_PLACES, TRIAL_CHOICES, TRIAL_ROUNDS)
         trials.append(images.energy / len(surfaces.scan) + 2.0 * float((~matched).sum()))
     order = np.argsort(trials)
     best = matches[order[0]]

@@ -48,10 +48,10 @@ def distance_profile(points: np.ndarray, normals: np.ndarray, distances: np.ndar
     return SurfaceFeatures(points[at], normals[at], to_seeds, angles, sure)
 
 
-def gradients(points: np.ndarray, normals: np.ndarray, values: np.ndarray, at: np.ndarray, radius: float,
-              neighbours: int = 48) -> np.ndarray:
+def gradients(points: np.ndarray, normals: np.ndarray, values: np.ndarray, at: np.ndarray, radius: float
+              ) -> np.ndarray:
     """Estimate gradient directions (S, n, 3) of values (S, m) along the surface, of length one at most."""
-    near_distance, near = cKDTree(points).query(points[at], min(neighbours, len(points)),
+    near_distance, near = cKDTree(points).query(points[at], min(48, len(points)),
                                                 distance_upper_bound=radius)
     valid = np.isfinite(near_distance)
     near = np.where(valid, near, at[:, None])

@@ -16,21 +16,12 @@ from .correspondences import Correspondences
 from .potentials import MOST_EDGE, SurfaceFeatures, distance_profile, edge_energy, most_place_energy, place_energy
 from .sheet import Sheet
 
-
-@dataclass(frozen=True)
-class BeliefLevel(Settings):
-    """One level of belief propagation, from coarse to fine.
-
-    Attributes
-    ----------
-    places : int
-        Candidate vertices of the template. Up to 2000 are spread evenly; for more, use all.
-    domain : int
-        Candidates that each point of the scan keeps, the likeliest ones.
-    """
-
-    places: Count
-    domain: Count
+SPREAD = 2000                # candidate vertices of the template that are spread evenly, before all others
+# Levels of belief propagation, coarse to fine: candidate vertices, and how many each point of the scan keeps, the
+# likeliest; the last level has all vertices. At each level messages are sent at most so many rounds.
+LEVELS = ((SPREAD, 80), (SPREAD, 60), (None, 60))
+ROUNDS = 40
+KEPT = 170                   # correspondences at most, the more certain ones of 240 points
 
 
 @dataclass(frozen=True)
@@ -41,25 +32,12 @@ class CorrelatedConfig(Settings):
     ----------
     points : int
         Points of the scan for which an image is sought.
-    keep : int
-        Largest number of correspondences in the result, the most confident ones.
     spacing : float
         Distance to which the scan is thinned, as a multiple of the template's size, √area.
-    levels : levels of belief propagation, coarse to fine
-    iterations : int
-        Largest number of message rounds at each level.
-
-    Examples
-    --------
-    >>> len(CorrelatedConfig(points=100).levels)
-    3
     """
 
     points: Count = 240
-    keep: Count = 170
     spacing: Cell = 0.009
-    levels: tuple[BeliefLevel, ...] = (BeliefLevel(2000, 80), BeliefLevel(2000, 60), BeliefLevel(1_000_000, 60))
-    iterations: Count = 40
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,14 +76,17 @@ class Images:
         return self.domains[np.arange(len(state)), state]
 
 
-def propagate_beliefs(surfaces: Surfaces, before: Images | None, level: BeliefLevel, config: CorrelatedConfig
+def propagate_beliefs(surfaces: Surfaces, before: Images | None, count: int | None, choices: int, rounds: int = ROUNDS
                       ) -> tuple[Surfaces, Images]:
-    """Run belief propagation at one level, in domains pruned by earlier beliefs, and rescale the template."""
+    """Run belief propagation at one level, in domains pruned by earlier beliefs, and rescale the template.
+
+    Of `count` candidate vertices of the template, or all, each point of the scan keeps as many `choices`.
+    """
     # candidates of each point: the best by unary energy, later the likeliest near earlier images
-    spread = np.arange(min(level.places, len(surfaces.places)))
+    spread = np.arange(len(surfaces.places))[:count]
     unary = place_energy(surfaces.scan, surfaces.places[spread], surfaces.size)
     wanted = unary if before is None else -_spread_beliefs(surfaces, before, spread)
-    domains = np.argsort(wanted, axis=1)[:, :level.domain]
+    domains = np.argsort(wanted, axis=1)[:, :choices]
     n, K = domains.shape
     # one more state means "no image": it costs half of the largest unary energy, and its edges half of the largest
     # pairwise one; unary energies count half, because they overlap with the pairwise ones
@@ -115,7 +96,7 @@ def propagate_beliefs(surfaces: Surfaces, before: Images | None, level: BeliefLe
     pairwise = np.full((len(surfaces.edges), K + 1, K + 1), 0.5 * MOST_EDGE, dtype=np.float32)
     pairwise[:, :K, :K] = edge_energy(surfaces.scan, surfaces.places, surfaces.edges, domains, surfaces.size)
     field = PairField(energies, surfaces.edges, pairwise)
-    beliefs = propagate(field, config.iterations)
+    beliefs = propagate(field, rounds)
     images = Images(domains, beliefs, field.energy(beliefs.states))
     # rescale the template by the short edges whose ends have images: bending changes long paths, but not short edges
     i, j = surfaces.edges[images.found[surfaces.edges].all(axis=1)].T
@@ -127,7 +108,7 @@ def propagate_beliefs(surfaces: Surfaces, before: Images | None, level: BeliefLe
     return replace(surfaces, places=places, scale=grown * surfaces.scale), images
 
 
-def result(surfaces: Surfaces, images: Images, config: CorrelatedConfig) -> Correspondences:
+def result(surfaces: Surfaces, images: Images) -> Correspondences:
     """Collect the correspondences, most confident first: by beliefs near the chosen image and strain of its edges."""
     # belief within 3% of the size of the chosen image: neighbouring vertices are as good
     matched, K = np.flatnonzero(images.found), images.domains.shape[1]
@@ -141,7 +122,7 @@ def result(surfaces: Surfaces, images: Images, config: CorrelatedConfig) -> Corr
                     for w in (cost, np.ones(len(edges))))
     # a mean edge energy of 4 divides the confidence by e
     confidence = sure * np.exp(-(total / np.maximum(count, 1))[matched] / 4.0)
-    order = np.argsort(-confidence, kind="stable")[:config.keep]
+    order = np.argsort(-confidence, kind="stable")[:KEPT]
     energies = {"field": images.energy, "scale": surfaces.scale,
                 "without_image": float(len(images.domains) - len(matched))}
     return Correspondences(surfaces.vertices[image[order]], surfaces.scan.points[matched[order]], confidence[order],
@@ -162,8 +143,8 @@ class Seeds:
     on_scan: np.ndarray
 
 
-def surfaces_of(template: Mesh, sheet: Sheet, seeds: Seeds, config: CorrelatedConfig) -> Surfaces:
-    """Compute the features of template and scan relative to the seeds."""
+def surfaces_of(template: Mesh, sheet: Sheet, seeds: Seeds, count: int, most: int | None = None) -> Surfaces:
+    """Compute the features of `count` points of the scan and at `most` so many of the template, or all."""
     size = float(np.sqrt(template.face_areas.sum()))
     clicked, on_scan, on_template = seeds.points, seeds.on_scan, seeds.on_template
     # scale of the scan: the median ratio of path lengths between seeds, as bending changes some of them
@@ -171,13 +152,13 @@ def surfaces_of(template: Mesh, sheet: Sheet, seeds: Seeds, config: CorrelatedCo
     far, near = on_template[a, seeds.vertices[b]], on_scan[a, clicked[b]]
     good = np.isfinite(far) & np.isfinite(near) & (far > 0) & (near > 0)
     scale = float(np.median(near[good] / far[good])) if good.any() else 1.0
-    chosen, edges = sheet.spread(config.points, 0.3 * size)
+    chosen, edges = sheet.spread(count, 0.3 * size)
     off = np.linalg.norm(sheet.points[clicked] - seeds.places, axis=1)     # far for a click without data
     same = (sheet.piece[chosen][:, None] == sheet.piece[clicked]) & (off < 3 * sheet.spacing)
     # a path that crosses a gap of the scan, or ends in one, has a trust of 0.3
     radius = 0.042 * size                                                  # averages directions over 6 cm on a man
     scan = distance_profile(sheet.points, sheet.normals, on_scan, chosen, radius, np.where(same, 1.0, 0.3))
-    vertices = _spread_vertices(template, min(max(level.places for level in config.levels), len(template.vertices)))
+    vertices = _spread_vertices(template, min(most or len(template.vertices), len(template.vertices)))
     places = distance_profile(scale * template.vertices, template.vertex_normals, scale * on_template, vertices, radius,
                               np.ones((len(vertices), len(clicked))))
     return Surfaces(size, scan, edges, places, vertices, scale)
@@ -185,8 +166,8 @@ def surfaces_of(template: Mesh, sheet: Sheet, seeds: Seeds, config: CorrelatedCo
 
 @lru_cache(maxsize=4)                # a folder of scans shares one template
 def _spread_vertices(template: Mesh, count: int) -> np.ndarray:
-    """Order vertices (count,): up to 2000 spread over the template first, then the rest."""
-    first = farthest_points(template.vertices, min(count, 2000))
+    """Order vertices (count,): up to `SPREAD` spread over the template first, then the rest."""
+    first = farthest_points(template.vertices, min(count, SPREAD))
     rest = np.setdiff1d(np.arange(len(template.vertices)), first)
     return np.concatenate([first, rest])[:count]
 

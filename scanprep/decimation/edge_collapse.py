@@ -16,9 +16,9 @@ HOLD = 3e-4                          # weight of distances to vertices against p
 class Rounds:
     """Decimates M bodies (N, M, 3), metres, with shared triangles, near the origin.
 
-    Borders, edges between different `labels` (F,) of triangles, and edges where the mesh bends by more than `crease`
-    radians are preserved as curves. The vertices `keep` (n,) stay in place. Costs are summed over the bodies. Shape
-    checks use the first body. `onto_vertices` collapses onto one of two vertices instead of the point of least error.
+    Borders, and edges between different `labels` (F,) of triangles, are preserved as curves. The vertices `keep` (n,)
+    stay in place. Costs are summed over the bodies. Shape checks use the first body. `onto_vertices`
+    collapses onto one of two vertices instead of the point of least error.
 
     The remaining `faces` (f, 3) use original vertex numbers; `face_rows` are their original rows. `owner` (N,) is the
     vertex that each one collapsed into, itself if it remains. `kinds` (N,) says whether a vertex is FREE, on a CURVE,
@@ -26,9 +26,9 @@ class Rounds:
     """
 
     def __init__(self, mesh: Mesh, points: np.ndarray, keep: np.ndarray | None = None,
-                 labels: np.ndarray | None = None, crease: float | None = None, onto_vertices: bool = False) -> None:
+                 labels: np.ndarray | None = None, onto_vertices: bool = False) -> None:
         N = len(points)
-        curves = curves_to_keep(mesh, labels, crease)
+        curves = curves_to_keep(mesh, labels)
         kinds = np.minimum(np.bincount(curves.ravel(), minlength=N), 3)
         self.kinds = np.array([FREE, FIXED, CURVE, FIXED])[kinds]    # ends and junctions of curves stay
         if keep is not None:
@@ -271,8 +271,8 @@ def wall_quadrics(mesh: Mesh, points: np.ndarray, areas: np.ndarray, curves: np.
     return curve_quadrics(points, curves, areas[curves].sum(axis=1), weight)
 
 
-def curves_to_keep(mesh: Mesh, labels: np.ndarray | None = None, crease: float | None = None) -> np.ndarray:
-    """Find edges (E, 2) to keep: borders, edges between labels, and creases sharper than `crease` radians."""
+def curves_to_keep(mesh: Mesh, labels: np.ndarray | None = None) -> np.ndarray:
+    """Find edges (E, 2) to keep: borders, and edges between labels."""
     stays = mesh.edge_use == 1
     inner, (left, right) = np.flatnonzero(mesh.edge_use == 2), mesh.face_pairs.T
     if labels is not None:
@@ -280,9 +280,6 @@ def curves_to_keep(mesh: Mesh, labels: np.ndarray | None = None, crease: float |
             raise ValueError(f"labels: expected one for each of {len(mesh.faces)} triangles, got "
                              f"shape {np.shape(labels)}")
         stays[inner[np.asarray(labels)[left] != np.asarray(labels)[right]]] = True
-    if crease is not None:
-        cosine = np.einsum("nd,nd->n", mesh.face_normals[left], mesh.face_normals[right])
-        stays[inner[cosine < np.cos(crease)]] = True
     return mesh.edges[stays]
 
 

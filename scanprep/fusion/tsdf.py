@@ -12,9 +12,10 @@ from ..geometry.mesh import Mesh, take_any_mesh
 from ..geometry.remeshing import smooth_taubin
 from ..geometry.sparse import unique_integers
 from ..geometry.surface import Rays, barycentric, mesh_and_camera
-from ..ranges import Cell, Cosine, Range, Settings, Share
+from ..ranges import Cell, Cosine, Range, Settings
 from ..repair.manifold import drop_small_components, split_vertices
 
+SPECK = 0.02                   # components with a smaller share of the vertices of the largest one are dropped
 BLOCK = 4                      # voxels along the side of a block, the unit of sparse storage; limits the truncation
 
 
@@ -30,10 +31,6 @@ class MergeConfig(Settings):
         Distance from a view's surface within which it contributes, at most 4.
     min_cosine : float
         Surface whose cosine to the line of sight is smaller has no weight.
-    carving : float
-        Weight with which a view marks the space in front of its surface as empty; 0 for never.
-    min_component : float
-        Components with a smaller share of the vertices of the largest one are dropped.
 
     Examples
     --------
@@ -44,8 +41,6 @@ class MergeConfig(Settings):
     voxel: Cell = 0.004
     truncation: Annotated[float, Range(1, BLOCK)] = 3.0
     min_cosine: Cosine = 0.1
-    carving: float = 0.0
-    min_component: Share = 0.02
 
 
 @dataclass(frozen=True, eq=False)
@@ -131,7 +126,7 @@ def merge_views(views: Sequence[Any], config: MergeConfig | None = None,
     # sum weighted distances over all views
     total, weight = np.zeros(len(keys)), np.zeros(len(keys))
     for number, view in enumerate(prepared):
-        voxels = np.arange(len(keys)) if config.carving else np.searchsorted(keys, near[number])
+        voxels = np.searchsorted(keys, near[number])
         for start in range(0, len(voxels), 500_000):                    # voxels at a time, to bound the memory
             _integrate(view, points, voxels[start:start + 500_000], total, weight, config)
         if progress:
@@ -140,7 +135,7 @@ def merge_views(views: Sequence[Any], config: MergeConfig | None = None,
     seen = weight > 0.02
     distance = np.divide(total, weight, out=np.zeros_like(total), where=seen)
     mesh = _zero_surface(grid, keys[seen], points[seen], distance[seen])
-    mesh = drop_small_components(split_vertices(mesh), config.min_component)
+    mesh = drop_small_components(split_vertices(mesh), SPECK)
     if not len(mesh.faces):
         raise ValueError("views: no surface is left after merging; is every camera on the outer side of its view?")
     return _with_colors(mesh, prepared)
@@ -232,8 +227,8 @@ def _integrate(view: _View, points: np.ndarray, which: np.ndarray, total: np.nda
     reach = config.truncation * config.voxel
     _, ahead, w, _ = view.look(points[which])
     ahead = np.nan_to_num(ahead, nan=-np.inf, neginf=-np.inf)
-    # beyond the truncation in front only carving counts; behind the surface the weight falls from half the reach on
-    w = np.where(ahead > reach, config.carving * w, w * np.clip(2 + 2 * ahead / reach, 0, 1))
+    # beyond the truncation in front nothing counts; behind the surface the weight falls from half the reach on
+    w = np.where(ahead > reach, 0.0, w * np.clip(2 + 2 * ahead / reach, 0, 1))
     use = w > 0
     total[which[use]] += w[use] * np.clip(ahead[use], -reach, reach)
     weight[which[use]] += w[use]

@@ -53,17 +53,17 @@ class DeformationGraph:
 
 
 @lru_cache(maxsize=4)                # a folder of scans shares one template
-def build_graph(template: Mesh, count: int, carriers: int = 4, reach: float = 0.18) -> DeformationGraph:
+def build_graph(template: Mesh, count: int) -> DeformationGraph:
     """Build a graph of `count` nodes spread over a template, linked along the surface and through the body.
 
-    Nodes that face each other through the inside are linked too, up to `reach` times the root of the template's area.
+    Nodes that face each other through the inside are linked too, up to 0.18 times the root of the template's area.
     These inner links keep the thickness of limbs where the scan has no data. They make a cross-section rotate as one.
     """
     nodes = farthest_points(template.vertices, min(count, len(template.vertices)))
-    carrying, weights = _carriers(template, nodes, min(carriers, len(nodes) - 1))
+    carrying, weights = _carriers(template, nodes, min(4, len(nodes) - 1))
     # surface links: two nodes that carry the same vertex
     pairs = np.concatenate([carrying[:, pair] for pair in combinations(range(carrying.shape[1]), 2)])
-    inner = _inner_links(template, nodes, reach * np.sqrt(template.face_areas.sum()))
+    inner = _inner_links(template, nodes, 0.18 * np.sqrt(template.face_areas.sum()))
     # each pair once, then both directions; every node shares its area among its edges
     links = np.unique(np.sort(np.concatenate([pairs[pairs[:, 0] != pairs[:, 1]], inner]), axis=1), axis=0)
     edges = np.concatenate([links, links[:, ::-1]])
@@ -105,8 +105,8 @@ def _carriers(template: Mesh, nodes: np.ndarray, K: int) -> tuple[np.ndarray, np
     return index[:, :K], share / share.sum(axis=1, keepdims=True)
 
 
-def _inner_links(template: Mesh, nodes: np.ndarray, reach: float, most: int = 8) -> np.ndarray:
-    """Find pairs (L, 2) of nodes that see each other through the inside, at most the `most` nearest of each node."""
+def _inner_links(template: Mesh, nodes: np.ndarray, reach: float) -> np.ndarray:
+    """Find pairs (L, 2) of nodes that see each other through the inside, at most the eight nearest of each node."""
     points, normals = template.vertices[nodes], template.vertex_normals[nodes]
     pairs = cKDTree(points).query_pairs(reach, output_type="ndarray")
     i, j = np.concatenate([pairs, pairs[:, ::-1]]).T
@@ -125,7 +125,7 @@ def _inner_links(template: Mesh, nodes: np.ndarray, reach: float, most: int = 8)
     order = np.lexsort((length, i))
     i, j = i[order], j[order]
     rank = np.arange(len(i)) - np.searchsorted(i, i)
-    return np.stack([i, j], axis=1)[rank < most]
+    return np.stack([i, j], axis=1)[rank < 8]
 
 
 @dataclass(frozen=True, eq=False)

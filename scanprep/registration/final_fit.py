@@ -23,8 +23,16 @@ from ..geometry.surface import OrientedPoints
 from ..geometry.target import Target, orient_by_mesh
 from ..threads import search_threads
 from .matches import NORMALS, QuadraticTargets, pull, tukey
-from .schedule import FinalFitConfig, FinalFitRound
+from .schedule import NOISE_WIDTH
 from .stretches import Field, gradient_operator
+
+# Lengths are in sizes. Each round: how wide rotations and stretches are smoothed, the distance to the data that costs
+# as much as a unit deviation from the smooth field, and the largest distance of a match. Wide first, so that folds
+# and tangential errors of the coarse registration vanish; then as fine as noise allows.
+ROUNDS = ((0.02, 0.007, 0.02), *3 * ((0.015, 0.004, 0.015),))
+SLIDE = 0.05                     # pull of the data along the surface, as a share of that across it
+STAY = 0.003                     # pull to the start where there are no data, against the pull of data
+MARK = 0.0002                    # weight of a landmark, as a share of the surface: clicks are off by millimetres
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,28 +43,25 @@ class FinalFit:
     seen: np.ndarray
     noise: float                 # metres, standard deviation of the scan across its surface
     strain: float                # root mean square over the area of the logarithm of the stretches
-    roughness: float             # the same against the smooth field of stretches
-    inverted: int                # triangles that face against their surroundings
-    needles: int                 # triangles that are stretched too far against their surroundings
     iterations: int              # rounds and repairs
     moved: float                 # metres, of the mean vertex in the last round
 
 
 def final_fit(template: Mesh, start: np.ndarray, target: Target,
-              landmarks: tuple[np.ndarray, np.ndarray] | None = None, config: FinalFitConfig | None = None) -> FinalFit:
+              landmarks: tuple[np.ndarray, np.ndarray] | None = None, noise_width: float = NOISE_WIDTH) -> FinalFit:
     """Fit a template that already lies near a scan, vertices (N, 3), to its surface.
 
-    Landmarks are vertices (L,) of the template and points (L, 3) of the scan.
+    Landmarks are vertices (L,) of the template and points (L, 3) of the scan. The noise of the scan is averaged over a
+    neighbourhood of `noise_width` sizes.
     """
-    config = config or FinalFitConfig()
-    surface = _SurfaceFit(template, start, target, landmarks, config)
+    surface = _SurfaceFit(template, start, target, landmarks, noise_width)
     x, before, stiff = start, start, np.ones(len(template.faces))
     # measure, smooth and solve; each round starts from the result of the last
-    for stage in config.rounds:
-        x, before = surface.lay_out(x, surface.fields(x, stage)[1], stage, stiff), x
+    for smoothing, tension, reach in ROUNDS:
+        x, before = surface.lay_out(x, surface.fields(x, smoothing)[1], tension, reach, stiff), x
     # repairs: around folds and needles the smooth field gets four times the weight each time, at most twelve times
     for repairs in range(13):
-        measured, smooth = surface.fields(x, stage)
+        measured, smooth = surface.fields(x, smoothing)
         n = template.face_normals[..., None]
         inverted = np.einsum("fdk,fdk->f", measured.R @ n, smooth.R @ n) < 0
         relative = measured.gradient @ np.linalg.inv(smooth.gradient)
@@ -68,13 +73,11 @@ def final_fit(template: Mesh, start: np.ndarray, target: Target,
         near = np.zeros(len(x))
         near[template.faces[inverted | needles]] = 1
         stiff = np.where(near[template.faces].any(axis=1), 4 * stiff, stiff)
-        x, before = surface.lay_out(x, smooth, stage, stiff), x
-    # report RMS log-stretch over the area, absolute and against the smooth field
-    strain, roughness = (float(np.sqrt(np.average(square, weights=surface.triangles.areas)))
-                         for square in ((measured.log_S**2).sum(axis=(1, 2)) / 3,
-                                        (0.25 * np.log(stretches)**2).mean(axis=1)))
-    return FinalFit(x, surface.data(x, stage.reach)[1], surface.scan.noise, strain, roughness, int(inverted.sum()),
-                    int(needles.sum()), len(config.rounds) + repairs, float(np.linalg.norm(x - before, axis=1).mean()))
+        x, before = surface.lay_out(x, smooth, tension, reach, stiff), x
+    # report RMS log-stretch over the area
+    strain = float(np.sqrt(np.average((measured.log_S**2).sum(axis=(1, 2)) / 3, weights=surface.triangles.areas)))
+    return FinalFit(x, surface.data(x, reach)[1], surface.scan.noise, strain, len(ROUNDS) + repairs,
+                    float(np.linalg.norm(x - before, axis=1).mean()))
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,10 +95,10 @@ class SmoothedScan:
     spacing: float
 
 
-def smooth_scan(target: Target, width: float, neighbours: int = 40) -> SmoothedScan:
+def smooth_scan(target: Target, width: float) -> SmoothedScan:
     """Denoise a scan: fit a quadratic surface around every point, with Gaussian weights of `width` metres."""
     P, n = target.points, target.normals
-    apart, near = cKDTree(P).query(P, min(neighbours, len(P)), workers=search_threads(len(P)))
+    apart, near = cKDTree(P).query(P, min(40, len(P)), workers=search_threads(len(P)))
     # two thousand points at a time: their neighbours fit into the cache
     blocks = (slice(first, first + 2000) for first in range(0, len(P), 2000))
     fitted = [_fit_surfaces(P[at], n[at], P[near[at]], n[near[at]], apart[at], width) for at in blocks]
@@ -137,26 +140,28 @@ class _SurfaceFit:
     """What the rounds of the final fit share: template, start, denoised scan, and pulls to start and landmarks."""
 
     def __init__(self, template: Mesh, start: np.ndarray, target: Target,
-                 landmarks: tuple[np.ndarray, np.ndarray] | None, config: FinalFitConfig) -> None:
+                 landmarks: tuple[np.ndarray, np.ndarray] | None, noise_width: float) -> None:
         size, N = float(np.sqrt(template.face_areas.sum())), len(start)
-        self.template, self.start, self.config, self.size = template, start, config, size
+        self.template = template
+        self.start = start
+        self.size = size
         self.triangles = gradient_operator(template)
         # degenerate triangles get a thousandth of the mean area, so that no equation vanishes
         self.areas = np.maximum(template.vertex_areas, 1e-3 * template.vertex_areas.mean())
         target = orient_by_mesh(target, template.with_vertices(start), NORMALS * size)
-        self.scan = smooth_scan(target, config.noise_width * size)
+        self.scan = smooth_scan(target, noise_width * size)
         # a pull to the start of 1e-9 keeps the equations regular without moving anything
         self.held = pull(N, np.arange(N), start, 1e-9 * self.areas)
         if landmarks is not None:
-            self.held += pull(N, *landmarks, np.full(len(landmarks[0]), config.landmarks * size**2))
+            self.held += pull(N, *landmarks, np.full(len(landmarks[0]), MARK * size**2))
 
-    def fields(self, x: np.ndarray, stage: FinalFitRound) -> tuple[Field, Field]:
-        """Measure the field of rotations and stretches, and smooth it robustly."""
+    def fields(self, x: np.ndarray, length: float) -> tuple[Field, Field]:
+        """Measure the field of rotations and stretches, and smooth it robustly over a length, in sizes."""
         measured = self.triangles.measure(x)
         weights = np.ones(len(self.template.faces))
         # reweighted twice: triangles off the smooth field by more than about 0.5 count little
         for _ in range(2):
-            smooth = self.triangles.smooth(measured, stage.field * self.size, weights)
+            smooth = self.triangles.smooth(measured, length * self.size, weights)
             off = np.linalg.norm(measured.gradient - smooth.gradient, axis=(1, 2))
             weights = 1 / (1 + (off / 0.5) ** 2) ** 2
         return measured, smooth
@@ -171,14 +176,14 @@ class _SurfaceFit:
         v = np.flatnonzero(seen)
         p = found.index[v]
         weights = self.areas[v] * tukey(found.distances[v], reach)
-        return pull(len(x), v, scan.points[p], weights, scan.normals[p], self.config.slide), seen
+        return pull(len(x), v, scan.points[p], weights, scan.normals[p], SLIDE), seen
 
-    def lay_out(self, x: np.ndarray, smooth: Field, stage: FinalFitRound, stiff: np.ndarray) -> np.ndarray:
+    def lay_out(self, x: np.ndarray, smooth: Field, tension: float, reach: float, stiff: np.ndarray) -> np.ndarray:
         """Solve for the vertices (N, 3) that best agree with the smooth gradients, the data and the landmarks."""
-        wanted, seen = self.data(x, stage.reach)
+        wanted, seen = self.data(x, reach)
         # without data, smoothing would straighten a bent limb: there a weak pull keeps the start
-        wanted = wanted + self.held + pull(len(x), np.arange(len(x)), self.start, self.config.stay * ~seen * self.areas)
-        weights = (stage.tension * self.size)**2 * self.triangles.areas * stiff
+        wanted = wanted + self.held + pull(len(x), np.arange(len(x)), self.start, STAY * ~seen * self.areas)
+        weights = (tension * self.size)**2 * self.triangles.areas * stiff
         # Poisson-type system K x + A x = force; preconditioned by K plus the largest eigenvalue of each block A
         K = self.triangles.stiffness(weights)
         across = np.linalg.eigvalsh(wanted.A)[:, 2]

@@ -24,10 +24,10 @@ def without_inverted(template: Mesh, x: np.ndarray) -> np.ndarray:
     return x
 
 
-def vertex_rotations(template: Mesh, x: np.ndarray, rings: int = 4) -> np.ndarray:
+def vertex_rotations(template: Mesh, x: np.ndarray) -> np.ndarray:
     """Estimate the rotation (N, 3, 3) around each vertex, from the template to vertices (N, 3).
 
-    It is averaged over `rings` rings of neighbours, so that a single folded triangle hardly changes it.
+    It is averaged over four rings of neighbours, so that a single folded triangle hardly changes it.
     """
     a, b = template.edges.T
     # sum of outer products of edges now and at rest; its nearest rotation is the Procrustes solution
@@ -38,7 +38,7 @@ def vertex_rotations(template: Mesh, x: np.ndarray, rings: int = 4) -> np.ndarra
     # average over the neighbours, ring by ring
     A = template.vertex_adjacency
     spread = diags_array(1 / (1 + np.asarray(A.sum(axis=1)).ravel())) @ (A + diags_array(np.ones(len(x))))
-    for _ in range(rings):
+    for _ in range(4):
         M = spread @ M
     return rotations.project(M.reshape(-1, 3, 3))
 
@@ -53,13 +53,12 @@ def find_inverted_triangles(template: Mesh, x: np.ndarray, linear: np.ndarray | 
     return np.einsum("fd,fd->f", template.with_vertices(x).face_normals, wanted) < 0
 
 
-def unfold(template: Mesh, x: np.ndarray, linear: np.ndarray | None = None, rings: tuple[int, ...] = (1, 1, 2)
-           ) -> np.ndarray:
+def unfold(template: Mesh, x: np.ndarray, rings: tuple[int, ...] = (1, 1, 2)) -> np.ndarray:
     """Re-solve small patches around inverted triangles: each edge as its surroundings rotated it.
 
     The patches stay small. Where skin really folds, triangles stay inverted, and wide patches would leave the data.
     """
-    linear = vertex_rotations(template, x) if linear is None else linear
+    linear = vertex_rotations(template, x)
     a, b = template.edges.T
     rest = template.vertices[b] - template.vertices[a]
     wanted = np.matmul(0.5 * (linear[a] + linear[b]), rest[..., None])[..., 0]

@@ -69,8 +69,6 @@ class GraphFit(Fit):
 def register_graph(inputs: RegistrationProblem, start: np.ndarray, config: RegistrationConfig,
                    progress: Callable[[int, int], None]) -> GraphFit:
     """Deform the template onto the scan by the stages of the schedule; from vertices, only by the near stages.
-
-    See `Method`.
     """
     # a start by vertices needs no stage that matches by paths; without path descriptors these stages are skipped
     near = start.shape == inputs.template.vertices.shape

@@ -43,11 +43,11 @@ def find_ends(template: Mesh, count: int, radius: float) -> tuple[End, ...]:
     return tuple(ends)
 
 
-def rotate_ends(template: Mesh, end: End, x: np.ndarray, scan: RigidFit, moved: float = 0.01) -> list[np.ndarray]:
+def rotate_ends(template: Mesh, end: End, x: np.ndarray, scan: RigidFit) -> list[np.ndarray]:
     """Fit an end of the body rigidly to the scan from several rotations: at most two candidate positions (n, 3) each.
 
     One candidate may slide along the body, the other is attached to its base. When a bent hand is mostly hidden, a
-    freely sliding hand fits the arm best. Candidates within `moved`, a share of the template's size, of the current
+    freely sliding hand fits the arm best. Candidates within a hundredth of the template's size of the current
     position or of each other are left out.
     """
     rest, middle = template.vertices[end.vertices], x[end.vertices].mean(axis=0)
@@ -67,7 +67,7 @@ def rotate_ends(template: Mesh, end: End, x: np.ndarray, scan: RigidFit, moved: 
                                               weight)
             fits.append((error, local @ rotation.T + place))
         best = fits[int(np.argmin([error for error, _ in fits]))][1]
-        if all(np.linalg.norm(best - other, axis=1).mean() > moved * scan.size for other in kept):
+        if all(np.linalg.norm(best - other, axis=1).mean() > 0.01 * scan.size for other in kept):
             kept.append(best)
     return kept[1:]
 

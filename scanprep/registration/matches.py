@@ -74,7 +74,7 @@ def prepare_problem(template: Mesh, scan: Mesh | np.ndarray, landmarks: Landmark
                                hints, descriptors(template_lengths, size))
 
 
-def path_anchors(landmarks: Landmarks | None, hints: Correspondences | None, target: Target, near: float, most: int = 8
+def path_anchors(landmarks: Landmarks | None, hints: Correspondences | None, target: Target, near: float
                  ) -> Landmarks | None:
     """Choose vertices (L,) and points (L, 3) from which paths are measured: landmarks, or confident hints spread out.
 
@@ -89,7 +89,7 @@ def path_anchors(landmarks: Landmarks | None, hints: Correspondences | None, tar
         return None
     # of the more confident half, eight far apart
     sure = np.flatnonzero(hints.confidence >= np.median(hints.confidence))
-    chosen = sure[farthest_points(hints.scan_points[sure], most)]
+    chosen = sure[farthest_points(hints.scan_points[sure], 8)]
     return hints.template_vertices[chosen], hints.scan_points[chosen]
 
 

@@ -12,7 +12,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, wraps
-from typing import Any, Protocol, TypeVar, cast
+from typing import Any, TypeVar, cast
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -116,20 +116,6 @@ class LedRegistration:
     worn: tuple[str, ...] = ()                  # hair and clothes that were left out, in words
 
 
-class Method(Protocol):
-    """A method that brings a template near a scan; `METHODS` holds those that can be chosen by name.
-
-    It takes the inputs, the initial rigid transform (4, 4) or vertices (N, 3), the settings and a callback for
-    (done, total). It returns the deformed template. Checks, final fit and quality figures are the same for all methods.
-    """
-
-    def __call__(self, inputs: RegistrationProblem, start: np.ndarray, config: RegistrationConfig,
-                 progress: Callable[[int, int], None]) -> Fit: ...
-
-
-METHODS: dict[str, Method] = {"graph": register_graph}
-
-
 def translate(what: Any, by: np.ndarray) -> Any:
     """Translate any input or result of a registration by `by` (3,), metres; return anything else as it is.
 
@@ -208,7 +194,7 @@ def register(template: Mesh, scan: Mesh | np.ndarray, landmarks: tuple[np.ndarra
     ------
     ValueError
         A template that is not one manifold component, an empty scan, values that are not finite, fewer than
-        three landmarks or landmarks that do not exist, an unknown method.
+        three landmarks or landmarks that do not exist.
 
     Examples
     --------
@@ -222,15 +208,12 @@ def register(template: Mesh, scan: Mesh | np.ndarray, landmarks: tuple[np.ndarra
     [Hahnel], [Allen], [Amberg]
     """
     config, report_progress = config or RegistrationConfig(), progress or (lambda done, total: None)
-    if config.method not in METHODS:
-        raise ValueError(f"method: expected one of {', '.join(METHODS)}, got {config.method!r}")
     # check the inputs; describe every point by position, normal and path lengths to landmarks
     inputs = prepare_problem(template, scan, landmarks, correspondences)
     begin = initial_transform(inputs) if start is None else _check_start(template, start)
     # bring the template near the scan, from stiff to soft; then fit the surface to the noise
     def fit_softly() -> Fit:
-        fit = METHODS[config.method](inputs, begin, config,
-                                     lambda done, total: report_progress(90 * done // total, 100))
+        fit = register_graph(inputs, begin, config, lambda done, total: report_progress(90 * done // total, 100))
         return snap_to_surface(inputs, fit, config)
 
     if begin.shape != (4, 4) and covers(template.with_vertices(begin), scan, inputs.size):
@@ -263,8 +246,8 @@ def _check_start(template: Mesh, start: np.ndarray) -> np.ndarray:
 
 def snap_to_surface(inputs: RegistrationProblem, fit: Fit, config: RegistrationConfig) -> Fit:
     """Fit the surface to the scan down to its noise, and repair inverted triangles."""
-    if config.final_fit is not None:
-        final = final_fit(inputs.template, fit.x, inputs.target, inputs.landmarks, config.final_fit)
+    if config.final_fit:
+        final = final_fit(inputs.template, fit.x, inputs.target, inputs.landmarks, config.noise_width)
         fit = Fit(final.vertices, {**fit.energies, "strain": final.strain}, fit.iterations + final.iterations,
                   final.moved)
     return replace(fit, x=without_inverted(inputs.template, fit.x))
@@ -322,38 +305,28 @@ def measure_fit(inputs: RegistrationProblem, fit: Fit, scan: Mesh | np.ndarray) 
     """Measure a fit against the whole scan, and return it with its quality figures."""
     body, size = inputs.template.with_vertices(fit.x), inputs.size
     # data within 1.5% of the size count, 2 cm on a man
-    data = evidence(body, inputs.target, 0.015 * size, NORMALS * size)
-    seen = data.confidence >= 0.5
+    confidence, distances = evidence(body, inputs.target, 0.015 * size, NORMALS * size)
+    seen = confidence >= 0.5
     landmark_rms = np.nan
     if inputs.landmarks is not None:
         apart = np.linalg.norm(fit.x[inputs.landmarks[0]] - inputs.landmarks[1], axis=1)
         landmark_rms = float(np.sqrt(np.mean(apart**2)))
     return Registration(
-        mesh=body, distances=np.where(seen, data.distances, np.nan), seen=seen,
-        rms=float(np.sqrt(body.vertex_areas[seen] @ data.distances[seen]**2 / body.vertex_areas[seen].sum()))
+        mesh=body, distances=np.where(seen, distances, np.nan), seen=seen,
+        rms=float(np.sqrt(body.vertex_areas[seen] @ distances[seen]**2 / body.vertex_areas[seen].sum()))
         if seen.any() else np.nan, landmark_rms=landmark_rms,
         converged=bool(fit.moved <= 0.001 * size and seen.any()), iterations=fit.iterations, energies=fit.energies,
-        inverted=int(find_inverted_triangles(inputs.template, fit.x).sum()), confidence=data.confidence,
+        inverted=int(find_inverted_triangles(inputs.template, fit.x).sum()), confidence=confidence,
         uncovered=share_uncovered(scan, body, 0.01 * size))
 
 
-@dataclass(frozen=True, eq=False)
-class Evidence:
-    """How well the scan supports every vertex of a registered template.
+def evidence(deformed: Mesh, target: Target, reach: float, scale: float) -> tuple[np.ndarray, np.ndarray]:
+    """Weigh the data near every vertex of a registered template: the confidence in them and their distances (N,).
 
-    The confidence (N,) goes from 0, no data here, to 1: a scanned surface lies here, faces the same way and does not
-    end here, and its points match this part of the template too. Distances (N,), metres, are to the tangent plane at
-    the nearest point that faces the same way; NaN where that is too far.
-    """
-
-    confidence: np.ndarray
-    distances: np.ndarray
-
-
-def evidence(deformed: Mesh, target: Target, reach: float, scale: float) -> Evidence:
-    """Weigh the data near every vertex of a registered template; points beyond `reach` (metres) count for nothing.
-
-    A unit difference of normals counts like a distance of `scale` metres.
+    The confidence goes from 0, no data here, to 1: a scanned surface lies here, faces the same way and does not end
+    here, and its points match this part of the template too. Distances, metres, are to the tangent plane at the nearest
+    point that faces the same way; NaN where that is too far. Points beyond `reach` (metres) count for nothing. A unit
+    difference of normals counts like a distance of `scale` metres.
     """
     def ramp(value: np.ndarray, low: float, high: float) -> np.ndarray:
         return np.clip((value - low) / (high - low), 0, 1)
@@ -387,13 +360,13 @@ def evidence(deformed: Mesh, target: Target, reach: float, scale: float) -> Evid
     inside = np.exp(-0.5 * (np.maximum(nearest - 2 * spacing, 0) / (2 * spacing)) ** 2) * (1 - ramp(edge, 0.3, 0.9))
     confidence, distances = np.zeros(len(x)), np.full(len(x), np.nan)
     confidence[v], distances[v] = near * facing * (inside * chosen)[v], off
-    return Evidence(confidence, distances)
+    return confidence, distances
 
 
-def share_uncovered(scan: Mesh | np.ndarray, registered: Mesh, far: float, samples: int = 5000) -> float:
+def share_uncovered(scan: Mesh | np.ndarray, registered: Mesh, far: float) -> float:
     """Compute the share of a scanned surface that lies further than `far` (metres) from a mesh."""
     points = scan.vertices if isinstance(scan, Mesh) else scan
-    every = slice(None, None, max(1, len(points) // samples))
+    every = slice(None, None, max(1, len(points) // 5000))
     off = Surface(registered).closest(points[every]).distances > far
     return float(np.average(off, weights=point_areas(scan)[every]))
 
@@ -413,15 +386,15 @@ def share_doubled(template: Mesh, registered: Mesh) -> float:
     return template.share_of_area(np.isin(np.arange(len(template.vertices)), pairs[alike & elsewhere]))
 
 
-def share_stretched(template: Mesh, registered: Mesh, factor: float = 2.0) -> float:
-    """Compute the share of the area stretched or shrunk by `factor` in some direction, against the median stretch.
+def share_stretched(template: Mesh, registered: Mesh) -> float:
+    """Compute the share of the area that is twice or half as long in some direction as the median stretch.
 
     So a smaller or slimmer person is nowhere stretched: one correct registration had 0.058 half as long as on the
     template, but only 0.007 half as long as its median.
     """
     long, short = principal_stretches(template, registered)
     usual = float(np.median(np.concatenate([long, short])))
-    stretched = (long > factor * usual) | (short < usual / factor)
+    stretched = (long > 2 * usual) | (short < usual / 2)
     return float(template.face_areas @ stretched / template.face_areas.sum())
 
 

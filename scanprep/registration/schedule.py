@@ -1,55 +1,12 @@
 """The schedule of a non-rigid registration, as data. Lengths are multiples of the template's size, √area."""
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Annotated, Any
 
 from ..ranges import FLAG, Axis, Cell, Count, Positive, Settings
 
-
-@dataclass(frozen=True)
-class FinalFitRound(Settings):
-    """One round of `final_fit`. Lengths are multiples of the template's size, √area.
-
-    Attributes
-    ----------
-    field : float
-        Length over which rotations and stretches are smoothed.
-    tension : float
-        Distance to the data that costs as much as a unit deviation from the smooth field.
-    reach : float
-        Largest distance of a match.
-    """
-
-    field: Positive
-    tension: Positive
-    reach: Positive
-
-
-@dataclass(frozen=True)
-class FinalFitConfig(Settings):
-    """Settings of `final_fit`. Lengths are multiples of the template's size, √area.
-
-    Attributes
-    ----------
-    rounds : rounds of measuring, smoothing and solving
-    noise_width : float
-        Neighbourhood over which the scan's noise is averaged.
-    slide : float
-        Pull of the data along the surface, as a share of that across it.
-    stay : float
-        Pull towards the start where there are no data, as a share of the pull of data.
-    landmarks : float
-        Weight of one landmark, as a share of the surface.
-    """
-
-    # wide first, so that folds and tangential errors of the coarse registration vanish; then as fine as noise allows
-    rounds: tuple[FinalFitRound, ...] = (FinalFitRound(field=0.02, tension=0.007, reach=0.02),
-                                         *3 * (FinalFitRound(field=0.015, tension=0.004, reach=0.015),))
-    noise_width: Positive = 0.007          # 1 cm on a man
-    slide: float = 0.05
-    stay: float = 0.003
-    landmarks: float = 0.0002
+NOISE_WIDTH = 0.007                    # sizes, 1 cm on a man: about five points of a scanner on either side
 
 
 @dataclass(frozen=True)
@@ -140,26 +97,26 @@ class RegistrationConfig(Settings):
 
     Attributes
     ----------
-    method : str
-        Method of the coarse registration, before the final fit: a name in `METHODS`.
     graph : stages of the deformation graph
     rolls : int
         How many other rolls are tried where limbs are anatomically impossible; 0 tries none.
-    final_fit : FinalFitConfig or None
-        The last pass: the surface follows the scan to its noise. None leaves it out.
+    final_fit : bool
+        The last pass: the surface follows the scan to its noise.
+    noise_width : float
+        Neighbourhood over which the last pass averages the scan's noise, as a multiple of the template's size.
     up : 'x', '-x', 'y', '-y', 'z' or '-z', optional
         The axis of the scan that points up, where it is known: people mostly stand, so a body model finds them better.
 
     Examples
     --------
-    >>> RegistrationConfig.quick().final_fit is None
-    True
+    >>> RegistrationConfig.quick().final_fit
+    False
     """
 
     graph: tuple[GraphStage, ...] = USUAL
     rolls: int = 3
-    final_fit: FinalFitConfig | None = field(default_factory=FinalFitConfig)
-    method: str = "graph"
+    final_fit: bool = True
+    noise_width: Positive = NOISE_WIDTH
     up: Annotated[Axis | None, FLAG] = None
 
     @property
@@ -171,7 +128,7 @@ class RegistrationConfig(Settings):
     def quick(cls) -> RegistrationConfig:
         """Return settings without the last steps: a third of the time, 7 mm from true landmarks instead of 6."""
         whole = cls()
-        return replace(whole, graph=whole.graph[:-1], final_fit=None)
+        return replace(whole, graph=whole.graph[:-1], final_fit=False)
 
     @classmethod
     def from_paper(cls) -> RegistrationConfig:
@@ -193,4 +150,4 @@ class RegistrationConfig(Settings):
             500   0.04    0      0.01      0.08  1     6      0.0001 | shape, coarsely
             2000  0.04    0      0.005     0.04  1     6      0.0001 | the same, with more nodes
             2000  0.02    0      0.005     0.04  1     6      0.0001 | shape
-            """), rolls=0, final_fit=None)
+            """), rolls=0, final_fit=False)

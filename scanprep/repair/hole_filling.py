@@ -3,21 +3,21 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Annotated, Any, Literal, NamedTuple, get_args
+from typing import Any, Literal, NamedTuple, get_args
 
 import numpy as np
 
 from ..geometry.mesh import Mesh, take_any_mesh, template_problem
 from ..geometry.surface import Rays, SeenSpace, Surface
 from ..judgement import Judgement
-from ..ranges import Count, Positive, Range, Settings
+from ..ranges import Count, Settings
 from .hole_patch import Patch
 from .intersections import intersecting_faces
 from .loops import group_loops, join_polygons
 from .manifold import repair, split_vertices
 from .volumetric_diffusion import EMPTY, diffuse_surface
 
-Method = Literal["auto", "fair", "diffusion", "poisson-open3d", "poisson-pymeshlab"]
+Method = Literal["auto", "fair", "diffusion"]
 MOST_EMPTY = 0.02                    # largest share of a good patch in free space; a worse one is tried again
 
 
@@ -27,19 +27,14 @@ class FillConfig(Settings):
 
     Attributes
     ----------
-    method : "auto", "fair", "diffusion", "poisson-open3d" or "poisson-pymeshlab"
+    method : "auto", "fair" or "diffusion"
         Fair patches, or patches pulled to a surface diffused through a volume. "auto" makes fair patches; where lines
         of sight are known, it tries diffusion if a patch violates free space or intersects something. Without lines of
-        sight diffusion was never better on the holes that we measured, and it is slow. Screened Poisson reconstruction
-        remeshes everything and needs the named library.
+        sight diffusion was never better on the holes that we measured, and it is slow.
     max_edges : int, optional
         Holes with longer borders stay open.
-    density : float
-        Size of the new triangles relative to those around the hole: larger means finer.
     join : bool
         Whether borders that face each other, as at a limb that was cut through, are joined by one patch.
-    poisson_depth : int
-        Octree depth of the Poisson methods.
 
     Examples
     --------
@@ -49,16 +44,13 @@ class FillConfig(Settings):
 
     method: Method = "auto"
     max_edges: Count | None = None
-    density: Positive = 2 ** 0.5
     join: bool = True
-    poisson_depth: Annotated[int, Range(1, 16)] = 8
 
 
 class FilledHole(NamedTuple):
     """How one hole was filled."""
 
     centre: np.ndarray          # (3,) metres
-    borders: int                # closed borders joined by the patch
     edges: int                  # their length in edges
     method: str                 # "fair" or "diffusion"
     intersections: int          # pairs of intersecting triangles, one of them new
@@ -103,8 +95,8 @@ def fill_holes(mesh: Mesh, config: FillConfig | None = None,
     Returns
     -------
     Mesh
-        Vertices in metres. Except with the Poisson methods, the vertices and triangles of `mesh` come first, unchanged.
-        Vertices where separate sheets touch are duplicated.
+        Vertices in metres. The vertices and triangles of `mesh` come first, unchanged. Vertices where separate sheets
+        touch are duplicated.
 
     Raises
     ------
@@ -122,20 +114,12 @@ def fill_holes(mesh: Mesh, config: FillConfig | None = None,
     [Liepa] triangulation, refinement, fairing
     [Davis] volumetric diffusion
     """
-    config = config or FillConfig()
-    if config.method.startswith("poisson"):
-        _check(mesh, config)
-        if config.method == "poisson-open3d":
-            from ..adapters.open3d_filters import open3d_poisson as poisson
-        else:
-            from ..adapters.pymeshlab_filters import meshlab_poisson as poisson
-        return close(poisson(mesh, config.poisson_depth))
     return fill_report(mesh, config, progress).mesh
 
 
 def fill_report(mesh: Mesh, config: FillConfig | None = None, progress: Callable[[int, int], None] | None = None,
                 views: Sequence[Any] = ()) -> FillReport:
-    """Close the holes of a mesh and report how; like `fill_holes`, for the methods that keep the mesh.
+    """Close the holes of a mesh and report how; like `fill_holes`.
 
     Fair patches fill all holes together. Then holes with bad patches are filled one by one in a volume. `views` are
     those that the mesh was merged from, RangeView or pairs (Mesh, camera position (3,)): their free space stays empty.
@@ -144,9 +128,10 @@ def fill_report(mesh: Mesh, config: FillConfig | None = None, progress: Callable
     [Davis] volumetric diffusion
     """
     config = config or FillConfig()
-    _check(mesh, config)
-    if config.method.startswith("poisson"):
-        raise ValueError(f"config.method: {config.method} remeshes everything; there are no single holes to report")
+    if not len(mesh.faces):
+        raise ValueError("mesh: expected a surface with holes, got one without triangles")
+    if config.method not in get_args(Method):
+        raise ValueError(f"config.method: expected one of {', '.join(get_args(Method))}, got {config.method!r}")
     if not mesh.is_edge_manifold:
         raise ValueError("mesh: expected at most two triangles at an edge, facing the same way; repair it first")
     # find the borders, and group those that one patch joins
@@ -202,14 +187,6 @@ def close(mesh: Mesh, config: FillConfig | None = None) -> Mesh:
     return mesh
 
 
-def _check(mesh: Mesh, config: FillConfig) -> None:
-    """Raise ValueError for a mesh without triangles or an unknown method."""
-    if not len(mesh.faces):
-        raise ValueError("mesh: expected a surface with holes, got one without triangles")
-    if config.method not in get_args(Method):
-        raise ValueError(f"config.method: expected one of {', '.join(get_args(Method))}, got {config.method!r}")
-
-
 @dataclass(frozen=True, eq=False)
 class _Filling:
     """Makes patches for the holes of one mesh, and rates them."""
@@ -234,7 +211,7 @@ class _Filling:
         polygons = [join_polygons(around.vertices, [local[loop] for loop in group]) for group in groups]
         # triangulate, refine, fair, and undo fairing where it makes intersections
         patch.triangulate(polygons, self.rays, progress)
-        patch.refine(self.config.density)
+        patch.refine()
         start = patch.mesh.vertices
         patch.fair()
         patch.untangle(start)
@@ -278,6 +255,6 @@ class _Filling:
             inside = self.seen.ahead(filled.vertices[fresh]) > EMPTY
             count = np.bincount(label[fresh], minlength=len(empty))
             empty = np.bincount(label[fresh], inside, len(empty)) / np.maximum(count, 1)
-        pieces = [(np.concatenate(group), len(group), label[group[0][0]]) for group in groups]
-        return [FilledHole(before.vertices[rim].mean(axis=0), borders, len(rim), method, int(crossing[p]),
-                           float(empty[p])) for rim, borders, p in pieces]
+        pieces = [(np.concatenate(group), label[group[0][0]]) for group in groups]
+        return [FilledHole(before.vertices[rim].mean(axis=0), len(rim), method, int(crossing[p]), float(empty[p]))
+                for rim, p in pieces]

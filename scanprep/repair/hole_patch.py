@@ -68,8 +68,9 @@ class Patch:
         """Flip new edges towards a Delaunay triangulation."""
         self.mesh = flip_edges(self.mesh, self._new, rounds=10, min_cosine=-1)
 
-    def refine(self, density: float) -> None:
+    def refine(self) -> None:
         """Split triangles at their centroids until they are as small as those around the hole [Liepa]."""
+        density = 2 ** 0.5                                             # of [Liepa]: larger means finer
         size = self._edge_size()
         self._flip()
         for _ in range(25):
@@ -143,10 +144,10 @@ class Patch:
         area = np.bincount(patch[new[:, 0]], self.mesh.face_areas[self.old_faces:], minlength=patch.max() + 1)
         return np.sqrt(np.maximum(area, 1e-12) / np.pi)[patch]
 
-    def untangle(self, start: np.ndarray, rounds: int = 10) -> None:
+    def untangle(self, start: np.ndarray) -> None:
         """Move new vertices back towards `start` (n, 3), the shape before fairing, around intersecting triangles."""
         goal, share = self.mesh.vertices, np.ones(len(self.mesh.vertices))
-        near = mean_of_neighbours(self.mesh)
+        near, rounds = mean_of_neighbours(self.mesh), 10
         patch = Mesh(goal, self.mesh.faces[self.old_faces:]).vertex_component
         for step in range(rounds):
             pairs = intersecting_faces(self.mesh, self._new)

@@ -11,20 +11,20 @@ from ..geometry.surface import SeenSpace, Surface
 EMPTY = 0.01                         # metres in front of a seen surface from which on space counts as free
 
 
-def diffuse_surface(mesh: Mesh, rim: np.ndarray, seen: SeenSpace | None = None, voxels: int = 12) -> Mesh:
+def diffuse_surface(mesh: Mesh, rim: np.ndarray, seen: SeenSpace | None = None) -> Mesh:
     """Diffuse the signed distance from the existing surface into holes, and extract its zero level.
 
     Near the surface the distance is known. Elsewhere it is the steady state of second-order diffusion, in which level
     sets continue in their direction instead of taking the shortest way. Free space keeps a positive distance. The
-    result contains existing surface and patches within the volume. The volume has at most `voxels` along the longest
-    side of the holes with borders `rim` (n,), and is never finer than the mesh.
+    result contains existing surface and patches within the volume. The volume has at most twelve voxels along the
+    longest side of the holes with borders `rim` (n,), and is never finer than the mesh.
 
     [Davis] volumetric diffusion, line-of-sight constraints
     """
     # a grid around the holes, with a margin of five voxels
     points = mesh.vertices[rim]
     extent = np.ptp(points, axis=0).max()
-    voxel = max(float(extent) / voxels, mesh.mean_edge)
+    voxel = max(float(extent) / 12, mesh.mean_edge)
     margin = 5 * voxel
     low = points.min(axis=0) - margin
     shape = np.ceil((np.ptp(points, axis=0) + 2 * margin) / voxel).astype(int) + 1

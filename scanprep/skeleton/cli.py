@@ -48,9 +48,7 @@ def skeleton(poses: Annotated[Path, Place("POSES")], output: Output, template: P
         Metric("left and right alike", "yes" if search.symmetric else "no"),
         Metric("restarts that ended with as many parts",
                f"{search.parts.count(len(found.parents))} of {len(search.parts)}"),
-        *(Metric(f"loop of {loop.length} links opened at",
-                 f"{' and '.join(loop.parts)}, {'joined' if loop.joined else 'no longer linked'}")
-          for loop in search.loops), *_shares(found, body)], {"skeleton": config},
+        *_shares(found, body)], {"skeleton": config},
                    judgement=Judgement.of(skeleton_problem(search, config.parts),
                                           [*find_doubtful_members(body, vertices, str(poses), names, ONE_BODY),
                                            *skeleton_doubts(found, config.parts),
@@ -60,7 +58,7 @@ def skeleton(poses: Annotated[Path, Place("POSES")], output: Output, template: P
 def edit(skeleton: Annotated[Path, Place("SKELETON")], output: Output, template: Path | None = None,
          edits: Path | None = None, merge: tuple[str, str] | None = None, rename: tuple[str, str] | None = None,
          unit: Unit | None = None) -> Outcome:
-    """Change a skeleton by hand: merge, split and rename parts, move joints.
+    """Change a skeleton by hand: merge and rename parts, move joints.
 
     Example: scape prep edit-skeleton set --merge chest shoulder_left --rename part3 neck -o set/skeleton.json
 
@@ -68,7 +66,7 @@ def edit(skeleton: Annotated[Path, Place("SKELETON")], output: Output, template:
         skeleton: Registered set with a skeleton, or a skeleton in JSON.
         output: JSON file to write.
         template: Its mesh; of a set it is known.
-        edits: JSON list of edits, such as [{"merge": [a, b]}, {"split": a, "names": [b, c]}, {"rename": {a: b}},
+        edits: JSON list of edits, such as [{"merge": [a, b]}, {"rename": {a: b}},
             {"move_joint": a, "position": [x, y, z]}], which are made first, in their order.
         merge: Two parts to become one, called like the first.
         rename: A part and its new name.
@@ -78,24 +76,24 @@ def edit(skeleton: Annotated[Path, Place("SKELETON")], output: Output, template:
               *([{"rename": {rename[0]: rename[1]}}] if rename else [])]
     if not wanted:
         raise ValueError("edits: expected --edits FILE or one of --merge, --rename")
-    before, body, poses = _read_skeleton(skeleton, template, unit)
-    after = apply_edits(before, body, wanted, poses)
+    before, body = _read_skeleton(skeleton, template, unit)
+    after = apply_edits(before, body, wanted)
     after.save(output)
     return Outcome(output, [Metric("edits", len(wanted)), Metric("parts before", len(before.parents)),
                             Metric("parts", len(after.parents)), *_shares(after, body)], {"edits": wanted},
                    judgement=Judgement())
 
 
-def _read_skeleton(path: Path, template: Path | None, unit: Unit | None) -> tuple[Skeleton, Mesh, np.ndarray | None]:
-    """Read a skeleton and its template, and the poses if it is a set that has them."""
+def _read_skeleton(path: Path, template: Path | None, unit: Unit | None) -> tuple[Skeleton, Mesh]:
+    """Read a skeleton and its template."""
     if path.is_dir():
         whole = RegisteredSet.load(path)
         if whole.skeleton is None:
             raise ValueError(f"{path}: expected a set with a skeleton, it has none; find one with scape prep skeleton")
-        return whole.skeleton, whole.template, whole.poses() if whole.entries else None
+        return whole.skeleton, whole.template
     if template is None:
         raise ValueError(f"template: expected the mesh that the skeleton {path} belongs to")
-    return Skeleton.load(path), read_mesh(template, unit), None
+    return Skeleton.load(path), read_mesh(template, unit)
 
 
 def _shares(skeleton: Skeleton, body: Mesh) -> list[Metric]:

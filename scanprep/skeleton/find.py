@@ -6,10 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..batch.room import Step, run_uncached
 from ..geometry.mesh import Mesh
 from ..threads import one_thread
-from .joints import Loop
 from .parts import SkeletonConfig
 from .restarts import SkeletonFinder
 from .symmetry import Symmetry
@@ -18,21 +16,11 @@ from .tree import Skeleton
 __all__ = ["SkeletonConfig", "find_skeleton", "search_skeleton"]
 
 
-@dataclass(frozen=True)
-class OpenedLoop:
-    """A loop of linked parts that was opened to get a tree."""
-
-    parts: tuple[str, str]  # the two parts where it was opened; twice the same if they were merged
-    joined: bool  # whether they were merged; else only their link was dropped
-    length: int  # number of links that lay on loops
-
-
 @dataclass(frozen=True, eq=False)
 class SkeletonSearch:
     """A skeleton with the facts of its search."""
 
     skeleton: Skeleton
-    loops: tuple[OpenedLoop, ...]
     symmetry: Symmetry               # the best mirror symmetry of the body, whether it holds or not
     symmetric: bool                  # left and right have the same parts by construction; borders may differ
     energies: tuple[float, ...]      # of every restart, as a share of the squared size of the body
@@ -40,7 +28,7 @@ class SkeletonSearch:
 
 
 def find_skeleton(template: Mesh, poses: np.ndarray, config: SkeletonConfig | None = None,
-                  progress: Callable[[int, int], None] | None = None, step: Step = run_uncached) -> Skeleton:
+                  progress: Callable[[int, int], None] | None = None) -> Skeleton:
     """Find rigid parts, the tree over them, and the joints, from registered poses of one body.
 
     Parts that never move against each other in the poses cannot be separated. A symmetric body gets the same parts left
@@ -56,8 +44,6 @@ def find_skeleton(template: Mesh, poses: np.ndarray, config: SkeletonConfig | No
         Settings.
     progress : callable, optional
         Called as progress(done, total).
-    step : callable, optional
-        Caches intermediate results, as `scanprep.batch.room.Step`.
 
     Returns
     -------
@@ -82,25 +68,24 @@ def find_skeleton(template: Mesh, poses: np.ndarray, config: SkeletonConfig | No
 
     [SCAPE] §3
     """
-    return search_skeleton(template, poses, config, progress, step).skeleton
+    return search_skeleton(template, poses, config, progress).skeleton
 
 
 @one_thread()
 def search_skeleton(template: Mesh, poses: np.ndarray, config: SkeletonConfig | None = None,
-                    progress: Callable[[int, int], None] | None = None, step: Step = run_uncached) -> SkeletonSearch:
-    """Find a skeleton as `find_skeleton` does, and return it with its loops, symmetry and restarts.
+                    progress: Callable[[int, int], None] | None = None) -> SkeletonSearch:
+    """Find a skeleton as `find_skeleton` does, and return it with its symmetry and restarts.
 
-    Arguments and errors are those of `find_skeleton`; `step` caches every restart.
+    Arguments and errors are those of `find_skeleton`.
 
     [Articulated]
     """
     config = config or SkeletonConfig()
-    finder = SkeletonFinder(template, poses, config, progress, step)
+    finder = SkeletonFinder(template, poses, config, progress)
     # the restart with the best score; its tree is adapted to the requested number of parts
     best = finder.runs[0]
     skeleton, symmetric = finder.skeleton(best, config.parts)
-    loops = tuple(_name_loop(loop, skeleton) for loop in best.loops)
-    search = SkeletonSearch(skeleton, loops, finder.symmetry, symmetric,
+    search = SkeletonSearch(skeleton, finder.symmetry, symmetric,
                             tuple(run.energy for run in finder.runs), tuple(len(run.links) + 1 for run in finder.runs))
     if progress is not None:
         progress(config.restarts + 1, config.restarts + 1)
@@ -112,9 +97,3 @@ def skeleton_problem(found: SkeletonSearch, wanted: int | None) -> str | None:
     if len(found.skeleton.parents) > 1 or wanted == 1:
         return None
     return "the body has one part and no joint; the meshes do not differ in pose, or are smaller than their unit says?"
-
-
-def _name_loop(loop: Loop, skeleton: Skeleton) -> OpenedLoop:
-    """Describe a loop by the parts of the skeleton that hold most of its two sides."""
-    a, b = (skeleton.names[int(np.bincount(skeleton.part_of_face[side]).argmax())] for side in loop.sides)
-    return OpenedLoop((a, b), loop.joined, loop.length)

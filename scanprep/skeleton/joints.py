@@ -5,7 +5,6 @@ Parts that only blend between two neighbours are dissolved, loops are opened, an
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 from scipy.sparse import coo_array
@@ -147,26 +146,16 @@ def _share_out(search: PartSearch, label: np.ndarray, band: int, between: np.nda
     return search.sides.spread(label[search.sides.half], partner)
 
 
-@dataclass(frozen=True, eq=False)
-class Loop:
-    """A loop of parts that was opened."""
-
-    sides: tuple[np.ndarray, np.ndarray]  # two (F,) bool: the triangles of the two parts where it was opened
-    joined: bool  # whether the two were merged; else only their link was dropped
-    length: int  # number of links that lay on loops
-
-
-def to_tree(search: PartSearch, label: np.ndarray) -> tuple[np.ndarray, np.ndarray, list[Loop]]:
+def to_tree(search: PartSearch, label: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Merge parts, and drop links, until parts and links form a tree.
 
     In a loop, the two parts whose union costs least are merged unless they are well separated. The paper did this by
     hand with the halves of crotch and chest. If all parts of a loop move freely, the link whose joint fits worst is
     dropped, such as that of thighs or fingers that touch. On a symmetric body both sides are treated alike. Returns
-    labels (F,), links (P - 1, 2) and the opened loops.
+    labels (F,) and links (P - 1, 2).
 
     [SCAPE] §3
     """
-    loops: list[Loop] = []
     while True:
         count = int(label.max()) + 1
         links = without_weak(search, label)
@@ -178,14 +167,11 @@ def to_tree(search: PartSearch, label: np.ndarray) -> tuple[np.ndarray, np.ndarr
             number = np.array([of_pair[tuple(links[i].tolist())] for i in loop])
             cheapest = number[extra[number].argmin()]
             close = separation[cheapest] < LOOP_SEPARATION * search.config.separation
-            joined = dropped is None or close
-            at = pairs[cheapest] if joined or dropped is None else links[dropped[0]]
-            loops.append(Loop((label == at[0], label == at[1]), bool(joined), len(loop)))
-            if joined or dropped is None:
+            if dropped is None or close:
                 break
             links = np.delete(links, dropped, axis=0)
         else:
-            return label, links, loops
+            return label, links
         joined = search.join(label, *pairs[cheapest])
         label = search.alternate(joined, rounds=4)
         if label.max() + 1 >= count:                             # the alternation split them again

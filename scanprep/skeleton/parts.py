@@ -11,6 +11,8 @@ from .motions import Moments, Motions, PosedSurface, agglomerate, fit_motions, h
 from .sides import Sides, cover, mirror_pairs
 from .symmetry import Symmetry
 
+PATCHES = 300                    # at first, about ten for each of the parts they are joined to
+START = 30                       # parts after the patches are joined: twice those of a person
 FADING = 0.8                     # a part dissolves when a blend of its neighbours explains this share of its motion
 
 
@@ -26,10 +28,6 @@ class SkeletonConfig(Settings):
         Neighbours with a smaller separation are merged, see `PartSearch.separations`.
     tolerance : float
         Residual, as a fraction of the square root of the surface area, that counts as rigid.
-    patches : int
-        Number of initial patches.
-    start : int
-        Number of parts after the patches are joined, before labels and motions alternate.
     symmetric : bool, optional
         Whether left and right have the same parts; by default they do if the body is symmetric.
     restarts : int
@@ -46,8 +44,6 @@ class SkeletonConfig(Settings):
     parts: Annotated[Count | None, FLAG] = None
     separation: Positive = 5.0
     tolerance: Positive = 0.001
-    patches: Count = 300
-    start: Count = 30
     symmetric: bool | None = None
     restarts: Count = 3
     seed: Seed = 0
@@ -62,12 +58,12 @@ class PartSearch:
     SMALLEST = 0.005                 # share of the surface: a smaller part is merged with a neighbour
 
     def __init__(self, surface: PosedSurface, config: SkeletonConfig, symmetry: Symmetry | None = None,
-                 rng: np.random.Generator | None = None) -> None:
+                 rng: np.random.Generator | None = None, patches: int = PATCHES) -> None:
         self.surface, self.config = surface, config
         self.sides = Sides(surface, symmetry)
         self.floor = config.tolerance**2 * surface.area
         self.width = 0.01 / np.sqrt(surface.area)       # price of a metre of border, in surface at mean cost
-        self.patch = cover(surface, min(config.patches, len(surface.face_weights)), self.sides, rng)
+        self.patch = cover(surface, min(patches, len(surface.face_weights)), self.sides, rng)
         self.forget()
 
     def forget(self) -> None:
@@ -247,7 +243,7 @@ def find_parts(search: PartSearch) -> np.ndarray:
     [Articulated]
     """
     patch, tied = search.patch, search.sides.tied
-    sets = -(-3 * search.config.start // 5) if tied else search.config.start    # a part and its mirror image are one
+    sets = -(-3 * START // 5) if tied else START    # a part and its mirror image are one
     label = agglomerate(search.surface.moments(patch), search.contacts(patch), sets,
                         search.sides.partners(patch) if tied else None)[patch]
     label = _split_and_join(search, search.join_down(label))
@@ -257,7 +253,7 @@ def find_parts(search: PartSearch) -> np.ndarray:
 def _split_and_join(search: PartSearch, label: np.ndarray) -> np.ndarray:
     """Cut parts and merge again, as long as that gives more parts, or as many that fit better."""
     tried: set[bytes] = set()
-    for _ in range(2 * search.config.start):
+    for _ in range(2 * START):
         cuts = [search.split(label, part) for part in range(label.max() + 1)]
         worth = [c for c in cuts if c[1] >= search.config.separation and c[0].tobytes() not in tried]
         if not worth:

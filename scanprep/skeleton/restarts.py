@@ -13,7 +13,6 @@ from ..geometry.members import ONE_BODY, check_members
 from ..geometry.mesh import Mesh, check_template
 from .joints import (
     LOOP_SEPARATION,
-    Loop,
     dissolve_bands,
     fewer_parts,
     middle_part,
@@ -26,11 +25,11 @@ from .joints import (
 )
 from .motions import PosedSurface
 from .names import name_parts
-from .parts import FADING, PartSearch, SkeletonConfig, find_parts
+from .parts import FADING, START, PartSearch, SkeletonConfig, find_parts
 from .symmetry import Symmetry, find_symmetry, mirror_poses
 from .tree import Skeleton, reorder
 
-Tree = tuple[np.ndarray, np.ndarray, list[Loop]]
+Tree = tuple[np.ndarray, np.ndarray]
 
 
 class SkeletonFinder:
@@ -78,7 +77,7 @@ class SkeletonFinder:
         if tied:
             # let the borders of both sides move freely, as no body is quite symmetric; keep that if the tree stays the
             # same
-            free = PartSearch(surface, replace(config, patches=2))
+            free = PartSearch(surface, config, patches=2)
             moved = free.alternate(label, rounds=12, core=True)
             touching = {tuple(pair) for pair in free.contacts(moved).tolist()}
             same = moved.max() == label.max() and touching.issuperset(map(tuple, np.sort(links, axis=1).tolist()))
@@ -109,7 +108,6 @@ class Restart:
 
     label: np.ndarray  # (F,) int: parts
     links: np.ndarray  # (P - 1, 2) int
-    loops: list[Loop]
     energy: float  # residual plus price of borders, as a share of the squared size of the body
     score: float  # log of the energy plus a penalty per part; the lowest is best
     search: PartSearch
@@ -124,10 +122,10 @@ def _restarts(surface: PosedSurface, config: SkeletonConfig, symmetry: Symmetry 
     runs = []
     with SideBySide(_search, searches) as found:
         for number, search in enumerate(searches):
-            label, links, loops = kept(f"{poses or ('free' if symmetry is None else 'symmetric')} restart {number}",
-                                       make=partial(found, number))
+            label, links = kept(f"{poses or ('free' if symmetry is None else 'symmetric')} restart {number}",
+                                make=partial(found, number))
             search.forget()
-            runs.append(Restart(label, links, loops, search.energy(label) / surface.area, _score(search, label),
+            runs.append(Restart(label, links, search.energy(label) / surface.area, _score(search, label),
                                 search))
             report_progress()
     return runs
@@ -139,13 +137,13 @@ def _best(runs: list[Restart]) -> Restart:
 
 
 def _search(search: PartSearch) -> Tree:
-    """Run one restart: labels and links of a tree, and the loops that were opened."""
+    """Run one restart: labels and links of a tree."""
     # rigid parts; without bands of skin; as a tree; with parts merged and cut while that helps; settled
     label = find_parts(search)                                                      # [Articulated]
     label = dissolve_bands(search, label)
-    label, links, loops = to_tree(search, label)                                    # [SCAPE] §3
+    label, links = to_tree(search, label)                                    # [SCAPE] §3
     label, links = _improve(search, label, links)
-    return *_settle(search, label, links), loops
+    return _settle(search, label, links)
 
 
 def _score(search: PartSearch, label: np.ndarray) -> float:
@@ -162,7 +160,7 @@ def _improve(search: PartSearch, label: np.ndarray, links: np.ndarray) -> tuple[
     creates a mere band of skin is rejected.
     """
     score = _score(search, label)
-    for _ in range(search.config.start):
+    for _ in range(START):
         many = int(label.max()) + 1
         for trial in (fewer_parts(search, label, max(many - 2, 1), LOOP_SEPARATION * search.config.separation),
                       more_parts(search, label, many + 2)):
@@ -189,7 +187,7 @@ def _settle(search: PartSearch, label: np.ndarray, links: np.ndarray) -> tuple[n
 
 def _is_held_back(run: Restart) -> bool:
     """Test whether parts without the symmetry would fit far better: an energy lower by 15%."""
-    free = PartSearch(run.search.surface, replace(run.search.config, patches=2))
+    free = PartSearch(run.search.surface, run.search.config, patches=2)
     return free.energy(free.alternate(run.label, rounds=10)) < 0.85 * run.search.energy(run.label)
 
 

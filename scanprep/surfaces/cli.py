@@ -14,7 +14,7 @@ from ..cli import MM, MeshArg, Output, PersonUnit, ScanArg, Unit, about_mesh
 from ..console import Metric, Outcome, bar
 from ..dataset import RegisteredSet
 from ..decimation.decimate import DecimateConfig, decimate
-from ..decimation.registered_set import DecimateSetConfig, write_decimated_set
+from ..decimation.registered_set import write_decimated_set
 from ..fusion.tsdf import MergeConfig, merge_views
 from ..geometry import storage
 from ..geometry.files import (
@@ -38,7 +38,7 @@ from ..judgement import Judgement
 from ..ranges import Faces
 from ..registration.lead import find_scanned_person
 from ..registration.unit import resolve_unit
-from ..repair.hole_filling import FillConfig, FilledHole, fill_holes, fill_report, filling_judgement
+from ..repair.hole_filling import FillConfig, fill_report, filling_judgement
 from ..repair.manifold import repair
 from ..words import number_of
 from .cloud import read_sound_surface
@@ -248,13 +248,9 @@ def fill(mesh: MeshArg, output: Output, views: Path | None = None, unit: Unit | 
     found = read_sound_surface(mesh, unit)
     before = found if found.is_edge_manifold else _manifold(found, mesh)
     seen = _read_views(views, unit) if views else ()
-    holes: tuple[FilledHole, ...] = ()
     with bar("filling holes") as progress:
-        if config.method.startswith("poisson"):
-            after = fill_holes(before, config, progress)
-        else:
-            report = fill_report(before, config, progress, seen)
-            after, holes = report.mesh, report.holes
+        report = fill_report(before, config, progress, seen)
+    after, holes = report.mesh, report.holes
     write_mesh(output, after)
     loops = len(after.boundary_loops)
     still_open = [f"{number_of(loops, 'hole is', 'holes are')} still open"] if loops else []
@@ -267,7 +263,7 @@ def fill(mesh: MeshArg, output: Output, views: Path | None = None, unit: Unit | 
 
 
 def reduce(mesh: MeshArg, output: Output, faces: Faces, landmarks: Path | None = None, unit: Unit | None = None,
-           config: DecimateConfig = DecimateConfig(), of_set: DecimateSetConfig = DecimateSetConfig()) -> Outcome:
+           config: DecimateConfig = DecimateConfig()) -> Outcome:
     """Fewer triangles for the same surface: of a mesh, or of a registered set, whose parts and landmarks stay in step.
 
     Example: scape prep decimate closed.ply --faces 14000 -o template.ply
@@ -279,7 +275,6 @@ def reduce(mesh: MeshArg, output: Output, faces: Faces, landmarks: Path | None =
         landmarks: Landmarks of the mesh, whose vertices stay where they are; a set has its own.
         unit: Unit of the mesh and its landmarks.
         config: Settings for a mesh.
-        of_set: Settings for a set.
     """
     # a registered set: all meshes by one map
     if mesh.is_dir():
@@ -289,10 +284,10 @@ def reduce(mesh: MeshArg, output: Output, faces: Faces, landmarks: Path | None =
             raise UsageError(f"--{wrong[0]}: it says nothing about a registered set, which {mesh} is")
         whole = RegisteredSet.load(mesh)
         with bar("decimating") as progress:
-            done = write_decimated_set(whole, output, faces, of_set, progress)
+            done = write_decimated_set(whole, output, faces, progress)
         return Outcome(output, [
             Metric("meshes", len(done.entries)), Metric("triangles before", len(whole.template.faces)),
-            *about_mesh(done.template)], {"decimate": of_set}, judgement=_as_template(done.template))
+            *about_mesh(done.template)], judgement=_as_template(done.template))
     given = read_scan_mesh(mesh, unit)
     before, keep = _manifold(given, mesh), None
     if landmarks and (named := read_landmark_vertices(landmarks, given, unit)):

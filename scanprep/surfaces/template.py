@@ -17,51 +17,35 @@ from ..geometry.mesh import Mesh, check_template, take_any_mesh, template_proble
 from ..geometry.remeshing import improve_triangles, smooth_taubin
 from ..geometry.surface import Surface
 from ..judgement import Judgement
-from ..ranges import Settings
 from ..registration.lead import find_scanned_person
 from ..registration.nonrigid import share_uncovered
 from ..repair.graft import graft
 from ..repair.handles import count_handles, cut_handles
-from ..repair.hole_filling import FillConfig, close
+from ..repair.hole_filling import close
 from ..repair.manifold import drop_thin, repair
 from ..skeleton.symmetry import find_symmetry
 from ..words import describe_result, number_of
 from .cloud import AWAY, mesh_of_cloud, mesh_of_view
 
+# A view of a scanner is merged with a shorter truncation than by default, as fingers are thin, and without the surface
+# that it saw at a grazing angle.
+MERGE = MergeConfig(voxel=0.004, truncation=2.0, min_cosine=0.15)
+DECIMATE = DecimateConfig(method="quadric", improve=True)
+SMOOTHING = 6                        # rounds, before and again after holes are filled: smooth borders give fair patches
+THINNEST = 0.007                     # metres: thinner parts are poorly seen fingers, and are removed
 LOST = 0.008                         # metres: what is farther off a template was lost, half the thickness of a finger
 
 
-@dataclass(frozen=True)
-class TemplateConfig(Settings):
-    """Settings of a template.
-
-    Attributes
-    ----------
-    merge : MergeConfig
-    fill : FillConfig
-    decimate : DecimateConfig
-    smoothing : int
-        Rounds of smoothing, before and again after holes are filled.
-    thinnest : float, metres
-        Thinner parts, such as poorly seen fingers, are removed.
-    """
-
-    merge: MergeConfig = field(default_factory=lambda: MergeConfig(voxel=0.004, truncation=2.0, min_cosine=0.15))
-    fill: FillConfig = field(default_factory=FillConfig)
-    decimate: DecimateConfig = field(default_factory=lambda: DecimateConfig(method="quadric", improve=True))
-    smoothing: int = 6
-    thinnest: float = 0.007
-
-
-def template_of_views(views: Sequence[Any], faces: int = 14000, config: TemplateConfig | None = None,
-                      progress: Callable[[int, int], None] | None = None) -> Mesh:
+def template_of_views(views: Sequence[Any], faces: int = 14000,
+                      progress: Callable[[int, int], None] | None = None, voxel: float = MERGE.voxel) -> Mesh:
     """Make a closed manifold mesh from range views of one subject: merge, repair, smooth, fill, decimate.
 
-    Views are RangeViews or pairs of a Mesh and a camera position (3,). ValueError if the result cannot serve as a
+    Views are RangeViews or pairs of a Mesh and a camera position (3,). They are merged in voxels of an edge length,
+    metres. ValueError if the result cannot serve as a
     template.
     """
-    config = config or TemplateConfig()
-    return _finish(merge_views(views, config.merge), faces, config, progress, "the merged views").mesh
+    merged = merge_views(views, replace(MERGE, voxel=voxel))
+    return _finish(merged, faces, progress, "the merged views", voxel=voxel).mesh
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,8 +81,7 @@ class MadeTemplate:
 
 @take_any_mesh
 def make_template(scans: Mesh | PointCloud | Sequence[Mesh | PointCloud], faces: int = 14000,
-                  config: TemplateConfig | None = None, progress: Callable[[int, int], None] | None = None
-                  ) -> MadeTemplate:
+                  progress: Callable[[int, int], None] | None = None) -> MadeTemplate:
     """Make the template of all registrations from your best scan, as `scape prep template` does.
 
     The body is taken alone, repaired, its holes filled, and decimated. Where the built-in people come to lie on it, it
@@ -110,8 +93,6 @@ def make_template(scans: Mesh | PointCloud | Sequence[Mesh | PointCloud], faces:
         One scan of the whole body; or views of one moment, which are aligned and merged.
     faces : int
         Triangles of the template.
-    config : TemplateConfig, optional
-        Settings.
     progress : callable, optional
         Called as progress(done, total).
 
@@ -142,15 +123,14 @@ def make_template(scans: Mesh | PointCloud | Sequence[Mesh | PointCloud], faces:
     scan = scans if isinstance(scans, Mesh | PointCloud) else views_without_cameras(scans)
     person = find_scanned_person(scan.vertices if isinstance(scan, Mesh) else scan.points)
     if person is None:
-        return template_of_scan(scan, faces, config, progress=progress)
+        return template_of_scan(scan, faces, progress=progress)
     body, named = person
-    made = template_of_scan(scan, faces, config, progress=progress, person=body)
+    made = template_of_scan(scan, faces, progress=progress, person=body)
     return replace(made, landmarks=carry_landmarks({name: body.vertices[v] for name, v in named.items()}, made.mesh)[0])
 
 
-def template_of_scan(scan: Mesh | PointCloud, faces: int = 14000, config: TemplateConfig | None = None,
-                     landmarks: np.ndarray | None = None, progress: Callable[[int, int], None] | None = None,
-                     person: Mesh | None = None) -> MadeTemplate:
+def template_of_scan(scan: Mesh | PointCloud, faces: int = 14000, landmarks: np.ndarray | None = None,
+                     progress: Callable[[int, int], None] | None = None, person: Mesh | None = None) -> MadeTemplate:
     """Make a closed manifold mesh from one scan of a whole body: clean, repair, fill, decimate.
 
     Parameters
@@ -159,8 +139,6 @@ def template_of_scan(scan: Mesh | PointCloud, faces: int = 14000, config: Templa
         Points, and meshes with overlapping views, are meshed anew.
     faces : int
         Triangles of the template.
-    config : TemplateConfig, optional
-        Settings.
     landmarks : (L, 3) float, metres, optional
         Points on the body, if it is not the largest piece of the scan.
     progress : callable, optional
@@ -179,7 +157,6 @@ def template_of_scan(scan: Mesh | PointCloud, faces: int = 14000, config: Templa
 
     [Liepa] hole filling; [QEM] pair contraction
     """
-    config = config or TemplateConfig()
     points = scan.vertices if isinstance(scan, Mesh) else scan.points
     kept = clean_scan(scan if isinstance(scan, Mesh) else points, landmarks=landmarks).kept
     notes = [] if kept.all() else [f"{(~kept).sum()} of {len(kept)} points were no part of the body"]
@@ -196,7 +173,7 @@ def template_of_scan(scan: Mesh | PointCloud, faces: int = 14000, config: Templa
         normals = None if scan.normals is None else scan.normals[kept]
         mesh = mesh_of_cloud(PointCloud(points[kept], normals))
         notes.append("points without triangles were meshed")
-    made = _finish(mesh, faces, config, progress, "the scan", landmarks, person)
+    made = _finish(mesh, faces, progress, "the scan", landmarks, person)
     return replace(made, notes=(*notes, *made.notes), lost=share_lost(mesh, made.mesh))
 
 
@@ -235,8 +212,9 @@ def views_without_cameras(views: Sequence[Mesh | PointCloud]) -> PointCloud:
                       np.concatenate([mesh.vertex_normals for mesh in meshes]))
 
 
-def _finish(mesh: Mesh, faces: int, config: TemplateConfig, progress: Callable[[int, int], None] | None, what: str,
-            landmarks: np.ndarray | None = None, person: Mesh | None = None) -> MadeTemplate:
+def _finish(mesh: Mesh, faces: int, progress: Callable[[int, int], None] | None, what: str,
+            landmarks: np.ndarray | None = None, person: Mesh | None = None, voxel: float = MERGE.voxel
+            ) -> MadeTemplate:
     """Smooth, fill and decimate an open surface; vertices at landmarks (L, 3), such as fingertips, stay.
 
     What the surface lacks of a `person` is taken from there.
@@ -245,14 +223,14 @@ def _finish(mesh: Mesh, faces: int, config: TemplateConfig, progress: Callable[[
     report_progress(1, 4)
     mesh = repair(mesh)
     # the same smoothing length as on merged views: on coarse scans as many rounds would round off fingers
-    rounds = min(config.smoothing, round(config.smoothing * (config.merge.voxel / mesh.mean_edge)**2))
+    rounds = min(SMOOTHING, round(SMOOTHING * (voxel / mesh.mean_edge)**2))
     scanned = mesh = smooth_taubin(mesh, rounds)                        # smooth borders give fair patches
     if person is not None:
         import igl
 
         # triangles of a sixteenth, as fine as those of a scan
         fine = Mesh(*igl.upsample(np.array(person.vertices), np.array(person.faces), 2))
-        mesh, pieces = graft(mesh, close(mesh, config.fill), fine)
+        mesh, pieces = graft(mesh, close(mesh), fine)
         if pieces:
             notes.append(f"{number_of(pieces, 'piece')} that the scan lacks, such as finger tips or toes, "
                          f"{'is' if pieces == 1 else 'are'} of the built-in people's body")
@@ -260,9 +238,9 @@ def _finish(mesh: Mesh, faces: int, config: TemplateConfig, progress: Callable[[
     if holes:
         notes.append(f"{number_of(holes, 'hole was', 'holes were')} filled")
     report_progress(2, 4)
-    mesh = close(mesh, config.fill)
+    mesh = close(mesh)
     if person is None:                                   # a body that was joined has no other thin parts than people
-        mesh = close(drop_thin(mesh, config.thinnest), config.fill)
+        mesh = close(drop_thin(mesh, THINNEST))
     joined, mesh = count_handles(mesh), cut_handles(mesh)
     apart = joined - count_handles(mesh)
     if apart:
@@ -274,20 +252,20 @@ def _finish(mesh: Mesh, faces: int, config: TemplateConfig, progress: Callable[[
     if mesh.volume < 0:
         mesh = Mesh(mesh.vertices, np.ascontiguousarray(mesh.faces[:, ::-1]), mesh.colors)
     keep = None if landmarks is None else np.unique(cKDTree(mesh.vertices).query(landmarks)[1])
-    small = _improve(decimate(mesh, faces, config.decimate, keep), surface, keep)
+    small = _improve(decimate(mesh, faces, DECIMATE, keep), surface, keep)
     balance = share_on_left(small)
     # one side may have at most 3% more of the triangles than its area suggests
     if balance is not None and abs(balance - 0.5) > 0.03:
         # least-error collapses may spend triangles on the noise of one side; shortest-edge collapses do not, but are
         # taken only where they cut off no hand: 0.001 of the surface are the tips of three fingers
-        even = _improve(decimate(mesh, faces, replace(config.decimate, method="even")), surface, keep)
+        even = _improve(decimate(mesh, faces, replace(DECIMATE, method="even")), surface, keep)
         evened = share_on_left(even) or 0.5
         if abs(evened - 0.5) < abs(balance - 0.5) and share_lost(mesh, even) < share_lost(mesh, small) + 0.001:
             notes.append(f"{100 * balance:.0f}% of the triangles were on the left side; made even, {100 * evened:.0f}% "
                          "are")
             small, balance = even, evened
     if template_problem(small):                                  # decimation left a degenerate triangle
-        small = close(small, config.fill)
+        small = close(small)
     check_template(small, what)
     far = Surface(scanned).closest(small.corners.mean(axis=1)).distances > scanned.mean_edge
     report_progress(4, 4)

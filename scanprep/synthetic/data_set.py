@@ -64,10 +64,10 @@ def stand(person: SyntheticPerson, pose: np.ndarray) -> GroundTruth:
 
 
 def click_landmarks(truth: GroundTruth, rng: np.random.Generator, error: float = 0.003,
-                    seen: np.ndarray | None = None, reach: float = 0.012) -> dict[str, np.ndarray]:
+                    seen: np.ndarray | None = None) -> dict[str, np.ndarray]:
     """Simulate landmarks clicked by a person, each coordinate off by a normal error of `error` metres.
 
-    Landmarks without a point of the scan, `seen` (n, 3), within `reach` are left out.
+    Landmarks without a point of the scan, `seen` (n, 3), within 12 mm are left out.
     """
     names = landmark_vertices()
     points = {name: truth.vertices[v] for name, v in names.items()}
@@ -75,7 +75,7 @@ def click_landmarks(truth: GroundTruth, rng: np.random.Generator, error: float =
     noise = {name: error * rng.normal(size=3) for name in names}
     if seen is not None:
         distances, _ = cKDTree(seen).query(np.stack(list(points.values())))
-        points = {name: point for (name, point), d in zip(points.items(), distances, strict=True) if d < reach}
+        points = {name: point for (name, point), d in zip(points.items(), distances, strict=True) if d < 0.012}
     return {name: point + noise[name] for name, point in points.items()}
 
 

@@ -132,11 +132,8 @@ def _read_pose(name: str) -> np.ndarray:
     return compose_pose(**_STORED["named"][name])
 
 
-def random_pose(rng: np.random.Generator, spread: float = 1.0) -> np.ndarray:
-    """Draw a plausible pose (16, 3): arms, legs, back and neck each from a named pose, with noise.
-
-    `spread` 0 gives rest, 1 poses as varied as the named ones.
-    """
+def random_pose(rng: np.random.Generator) -> np.ndarray:
+    """Draw a plausible pose (16, 3): arms, legs, back and neck each from a named pose, with noise."""
     limbs = [4, 5, 6], [7, 8, 9], [0, 10, 11, 12, 13, 14, 15], [1, 2], [3]
     # standard deviations of the noise in degrees, by part
     looseness = np.radians(np.array([4, 4, 4, 7, 8, 6, 9, 8, 6, 9, 4, 4, 5, 4, 4, 5.0]))
@@ -150,7 +147,7 @@ def random_pose(rng: np.random.Generator, spread: float = 1.0) -> np.ndarray:
     noise = rng.normal(size=(16, 3)) * looseness[:, None] * 0.7
     # elbows and knees get no noise: they are hinges
     noise[[5, 8, 11, 14]] = 0.0
-    return spread * (pose + noise)
+    return pose + noise
 
 
 def mirror_synthetic_pose(pose: np.ndarray) -> np.ndarray:
@@ -158,10 +155,10 @@ def mirror_synthetic_pose(pose: np.ndarray) -> np.ndarray:
     return pose[..., MIRROR_PART, :] * [1, -1, -1]
 
 
-def synthesise_walk(frames: int, rate: float = 60.0, speed: float = 1.0) -> tuple[np.ndarray, np.ndarray]:
+def synthesise_walk(frames: int, rate: float = 60.0) -> tuple[np.ndarray, np.ndarray]:
     """Make a walk straight ahead.
 
-    The lower foot stays on the floor; at speed 1 a gait cycle takes 1.1 seconds.
+    The lower foot stays on the floor; a gait cycle takes 1.1 seconds.
 
     Parameters
     ----------
@@ -169,8 +166,6 @@ def synthesise_walk(frames: int, rate: float = 60.0, speed: float = 1.0) -> tupl
         Number of frames.
     rate : float, frames per second
         Frame rate.
-    speed : float
-        1 is a normal walk.
 
     Returns
     -------
@@ -178,7 +173,7 @@ def synthesise_walk(frames: int, rate: float = 60.0, speed: float = 1.0) -> tupl
     trans : (frames, 3) float, metres
         Place of the root relative to rest.
     """
-    cycles = np.arange(frames) / rate * speed / 1.1
+    cycles = np.arange(frames) / rate / 1.1
     poses = np.stack([_stride(phase) for phase in cycles % 1.0])
     # tabulate one cycle: lift and advance of the root that keep the lower foot on the floor
     steps = 120

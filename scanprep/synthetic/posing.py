@@ -153,10 +153,10 @@ def _smoothstep(x: np.ndarray) -> np.ndarray:
     return x * x * (3 - 2 * x)
 
 
-def _smooth(x: np.ndarray, rounds: int = 8) -> np.ndarray:
-    """Smooth vertices by averaging with their neighbours."""
+def _smooth(x: np.ndarray) -> np.ndarray:
+    """Smooth vertices by averaging with their neighbours, eight times."""
     mean = neighbour_mean()
-    for _ in range(rounds):
+    for _ in range(8):
         x = 0.4 * x + 0.6 * (mean @ x)
     return x
 

@@ -57,17 +57,6 @@ class RangeView:
         """(n, 3) float, metres: the measured points."""
         return self.mesh.vertices
 
-    def project(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Project points (n, 3): column u, row v (n,), pixels, and depth (n,), metres."""
-        local = (points - self.camera) @ self.T_world_camera[:3, :3]
-        u, v, _ = ((local / local[:, 2:]) @ self.intrinsics.T).T
-        return u, v, local[:, 2]
-
-    def rays(self) -> np.ndarray:
-        """Compute unit directions (H, W, 3) of the pixels in the world."""
-        return pixel_rays(self.depth.shape, self.intrinsics, self.T_world_camera[:3, :3])
-
-
 @dataclass(frozen=True, eq=False)
 class Scan:
     """All views of one body."""

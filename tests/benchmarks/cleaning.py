@@ -148,8 +148,6 @@ def merge_peers(views: list[RangeView], truth: Mesh) -> Iterator[tuple[str, dict
 
 def fillers() -> dict[str, Callable[[Mesh], tuple[Mesh, bool]]]:
     """Name -> function to a filled mesh and whether the triangles of the old one come first in it."""
-    from scanprep.adapters.open3d_filters import open3d_poisson
-
     def ours(method: str) -> Callable[[Mesh], tuple[Mesh, bool]]:
         return lambda mesh: (fill_report(mesh, FillConfig(method=method)).mesh, True)     # type: ignore[arg-type]
 
@@ -158,7 +156,7 @@ def fillers() -> dict[str, Callable[[Mesh], tuple[Mesh, bool]]]:
     try:
         import open3d  # noqa: F401
 
-        found |= {"open3d fill_holes": open3d_fill, "open3d Poisson": lambda mesh: (open3d_poisson(mesh, 8), False)}
+        found |= {"open3d fill_holes": open3d_fill, "open3d Poisson": open3d_poisson}
     except (ImportError, OSError):
         pass
     try:
@@ -192,6 +190,15 @@ def open3d_fill(mesh: Mesh) -> tuple[Mesh, bool]:
     given = o3d.t.geometry.TriangleMesh.from_legacy(legacy)          # what comes back may point into it
     filled = given.fill_holes(1e6)
     return Mesh(filled.vertex.positions.numpy().astype(float), filled.triangle.indices.numpy()), False
+
+
+def open3d_poisson(mesh: Mesh) -> tuple[Mesh, bool]:
+    import open3d
+
+    cloud = open3d.geometry.PointCloud(open3d.utility.Vector3dVector(np.array(mesh.vertices)))
+    cloud.normals = open3d.utility.Vector3dVector(np.array(mesh.vertex_normals))
+    closed, _ = open3d.geometry.TriangleMesh.create_from_point_cloud_poisson(cloud, depth=8, n_threads=1)
+    return Mesh(np.asarray(closed.vertices), np.asarray(closed.triangles)), False
 
 
 def pymeshlab_fill(mesh: Mesh) -> tuple[Mesh, bool]:

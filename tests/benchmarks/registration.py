@@ -1,7 +1,7 @@
 """Registration of mesh000 to the virtual scans of `scans.py`: accuracy beside time.
 
     SCAPEKIT_DATA=... python tests/benchmarks/registration.py [--marks 10|7|4|0] [--front] [--set tuning|held]
-        [--through auto|none|MODEL] [--poses 3,8] [--men 3] [--published] [--method NAME] [--kept FOLDER] [-o FILE]
+        [--through auto|none|MODEL] [--poses 3,8] [--men 3] [--published] [--kept FOLDER] [-o FILE]
 
 With fewer than seven marks the template is led through a model, the built-in people, and with none by correspondences
 where that leaves something to doubt; `--through none` leaves the model out. What we lose at: the surface is right long
@@ -14,7 +14,6 @@ from __future__ import annotations
 
 import argparse
 import time
-from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -26,7 +25,7 @@ from scanprep.judgement import size
 from scanprep.registration.figures import ScanFigures, figures_of, review
 from scanprep.registration.lead import Lead, lead_of
 from scanprep.registration.limbs import PlausibilityIssue, limb_doubts
-from scanprep.registration.nonrigid import METHODS, Registration, register, registration_problem
+from scanprep.registration.nonrigid import Registration, register, registration_problem
 from scanprep.registration.person import PersonParts, person_parts
 from scanprep.registration.repair import repair_limbs
 from scanprep.registration.schedule import RegistrationConfig
@@ -123,14 +122,13 @@ def main() -> None:
     parser.add_argument("--poses", help="numbers of SCAPE poses instead of those of the set")
     parser.add_argument("--men", help="numbers of SPRING men instead of those of the set")
     parser.add_argument("--published", action="store_true", help="the registration of [SCAPE] instead of ours [Hahnel]")
-    parser.add_argument("--method", choices=METHODS, default="graph", help="how the template is brought near the scan")
     parser.add_argument("--kept", type=Path, help="folder for the registered vertices")
     parser.add_argument("-o", "--output", help="write all figures here")
     args = parser.parse_args()
     data = load_real()
     poses, men = (tuple(int(k) for k in text.split(",") if k) if text is not None else default
                   for text, default in zip((args.poses, args.men), SETS[args.chosen], strict=True))
-    config = replace(RegistrationConfig.from_paper() if args.published else RegistrationConfig(), method=args.method)
+    config = RegistrationConfig.from_paper() if args.published else RegistrationConfig()
     parts = person_parts(data.template)
     assert parts is not None, "the template is a person"
     lead = lead_of(data.template, args.through) if len(MARKS[args.marks]) < FEW else None
@@ -151,7 +149,6 @@ def main() -> None:
     if args.output:
         write_report(args.output, {"marks": args.marks, "front": args.front, "published": args.published,
                                  "through": args.through if lead else "none",
-                                 "method": args.method,
                                  "machine": machine(), "summary": summary, "flags": told, "rows": rows})
 
 

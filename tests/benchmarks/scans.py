@@ -53,7 +53,7 @@ class TestScan:
         from scanprep.fusion.tsdf import MergeConfig
         from scanprep.repair.manifold import repair
 
-        closed = fill_holes(repair(merge_views(self.views, MergeConfig(voxel=0.006, min_component=0.5))))
+        closed = fill_holes(repair(merge_views(self.views, MergeConfig(voxel=0.006))))
         return decimate(closed, 30_000, DecimateConfig("even"))
 
     def landmarks(self, data: RealData, which: str) -> tuple[np.ndarray, np.ndarray] | None:

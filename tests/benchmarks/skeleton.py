@@ -97,7 +97,7 @@ def facts(found: SkeletonSearch, mesh: Mesh, poses: np.ndarray, seconds: float) 
     partner = part_partners(mesh, skeleton, found.symmetry) if found.symmetry.holds else None
     uneven = None if partner is None else float((1 - share[partner] / np.maximum(share, share[partner])).max())
     return {"parts": len(skeleton.parents), "names": list(skeleton.names), "symmetric": found.symmetric,
-            "left_and_right_differ_in_area": uneven, "loops": [list(loop.parts) for loop in found.loops],
+            "left_and_right_differ_in_area": uneven,
             "restarts_ended_with": list(found.parts), "energies": list(found.energies), "cpu_s": seconds,
             "rigid_mm": 1e3 * rigid_error(mesh, poses, skeleton)}
 

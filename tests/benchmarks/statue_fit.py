@@ -79,7 +79,7 @@ def fits(name: str, body: Mesh, marks: tuple[np.ndarray, np.ndarray]) -> list[di
 
     rest = humanoid().mesh
     scan = Mesh(*igl.loop(body.vertices, body.faces, 1))
-    start = register(rest, body, marks, RegistrationConfig(final_fit=None)).mesh.vertices
+    start = register(rest, body, marks, RegistrationConfig(final_fit=False)).mesh.vertices
 
     def finally_fitted() -> np.ndarray:
         x = final_fit(rest, start, target_of(scan)).vertices
