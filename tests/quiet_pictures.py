@@ -23,9 +23,9 @@ def small_pictures():
         yield
 
 
-def coarse(shapes, camera, width, height, ground=False):
+def coarse(shapes, camera, width, height):
     """Drawn as always, with a quarter of the pixels each way."""
-    return shading.render(shapes, camera, width // 4, height // 4, ground)
+    return shading.render(shapes, camera, width // 4, height // 4)
 
 
 @contextmanager

@@ -1,7 +1,6 @@
 """A result of `scape mosh` that is mended: markers moved, exchanged or taken away, saved as a layout, run again."""
 import json
 import shutil
-import time
 from dataclasses import replace
 from pathlib import Path
 
@@ -14,12 +13,12 @@ from hostile_messages import check_it_goes_on
 from mosh_folders import QuietWork, run, small_pictures, write_people
 
 from completion import MarkerLayout, MarkerSequence, read_markers, write_markers
+from completion.__main__ import main
 from completion.mocap.mosh import cli
 from completion.mocap.mosh.call import MoshCall
 from completion.mocap.mosh.mend import MoshApp
-from completion.mocap.mosh.mended_layout import Spot, apply_corrections, changes
+from completion.mocap.mosh.mended_layout import changes
 from scanprep.batch.calls import RUN
-from scanprep.batch.opening import lock_output
 from scanprep.batch.ownership import HOME
 from scanprep.geometry.storage import StorageError
 from scanprep.viewer.messages import Message
@@ -72,18 +71,6 @@ def moved(place, app):
     np.testing.assert_allclose(app.scan.places[MOVED], spot, atol=1e-6)
 
 
-def test_a_changed_layout_is_told_by_its_changes():
-    vertices = np.array([3, 5, 8, 9])
-    layout = MarkerLayout(("A", "B", "C", "D"), vertices, [0.01, 0.02, 0.01, 0.01], aliases={"a": "A"}, loose=("B",))
-    spots = {"A": Spot.of(layout, "B"), "B": Spot(np.array([1, 2, 4]), np.array([0.2, 0.3, 0.5]), 0.02), "D": None}
-    after = apply_corrections(layout, spots)
-    assert set(after.labels) == {"A", "B", "C"} and after.loose == ("A",) and after.aliases == {"a": "A"}
-    back = changes(layout, after)
-    assert set(back) == set(spots) and back["D"] is None
-    assert all(back[label].same(spots[label]) for label in "AB")
-    assert changes(layout, layout) == {} == changes(layout, apply_corrections(layout, {}))
-
-
 def test_corrections_are_saved_beside_and_undone(place):
     app, given = allowed(MoshApp(place / "out")), (place / "layout.json").read_bytes()
     state, file = told(app), place / "out" / "corrected_layout_1.json"
@@ -131,17 +118,6 @@ def test_a_correction_is_of_the_layout_and_so_of_all_people(place, tmp_path):
                for scan, places in zip(app.scans, found, strict=True))
     with pytest.raises(ValueError, match="expected 0 to 1, got 2"):
         sent(app, "open", scan=2)
-
-
-def test_another_run_at_work_is_told_and_corrections_stay(place):
-    app = allowed(MoshApp(place / "out"))
-    sent(app, "remove", pane=1, name="M5")
-    with lock_output(place / "out" / HOME / "lock", place / "out"):
-        sent(app, "run")
-        while app.working is not None:
-            time.sleep(0.02)
-    assert "another run is at work" in app.note and told(app)["changed"] == ["M5"]
-    sent(app, "undo")
 
 
 def test_a_result_that_was_moved_or_made_earlier_is_told(place, tmp_path):
@@ -208,3 +184,11 @@ def test_a_built_in_model_is_kept_by_its_name(tmp_path, monkeypatch):
 def test_hostile_messages_are_refused_in_a_line(place, tmp_path, capfd):
     shutil.copytree(place, tmp_path / "copy")
     check_it_goes_on(MoshApp(tmp_path / "copy" / "out"), capfd)
+
+
+def test_the_page_is_opened_for_one_folder(place, monkeypatch, capsys):
+    shown = []
+    monkeypatch.setattr("scanprep.viewer.server.serve", lambda app, *_given: shown.append(app.name))
+    assert main(["view", "--mend", str(place / "out")]) == 0 and shown == ["mosh"]
+    assert main(["view", "--mend", str(place / "out"), str(place / "out")]) == 2
+    assert "--mend: expected one folder of scape mosh, got 2" in capsys.readouterr().err

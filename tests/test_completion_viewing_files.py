@@ -60,13 +60,6 @@ def test_a_file_beside_that_has_no_landmarks_hides_nothing(files, tmp_path):
     assert len(content.shapes) == 1 and "body.json" in content.notes[0]
 
 
-def test_a_landmark_file_without_landmarks_shows_the_mesh(files, tmp_path):
-    (tmp_path / "body.ply").write_bytes((files / "body.ply").read_bytes())
-    (tmp_path / "landmarks.json").write_text("{}")
-    app = app_of(tmp_path, "body.ply", "landmarks.json")
-    assert not app.problems and len(app.contents[0].shapes) == 1
-
-
 def test_landmarks_and_layouts_are_laid_on_what_was_named_before(files, tmp_path, model):
     layout = {"markersets": [{"type": "body", "distance_from_skin": 0.01, "indices": {"A": 3, "B": 40}}]}
     (tmp_path / "layout.json").write_text(json.dumps(layout))

@@ -8,10 +8,8 @@ from viewing_apps import OPEN, a_motion, app_of, seen, write_files
 
 from completion.mocap.files.markers import MarkerSequence, write_markers
 from completion.motion import Motion
-from completion.viewing.contents import Stance
 from completion.viewing.files import Files
 from completion.viewing.motions import as_columns
-from scanprep.geometry import rotations
 
 
 @pytest.fixture(scope="module")
@@ -29,13 +27,6 @@ def test_a_motion_as_columns(model):
     basis, coefficients = as_columns(motion, subject, motion.vertices(subject, np.arange(0, 300, 7)))
     assert basis.shape[1] < 60
     assert np.abs(np.einsum("nr,trc->tnc", basis, coefficients) - motion.vertices(subject)).max() < 2e-3
-
-
-def test_a_motion_of_another_up_axis_stands(model):
-    lying = np.zeros((5, 4, 3))
-    lying[:, 0] = rotations.log(np.array([[0, 1.0, 0], [-1, 0, 0], [0, 0, 1]]))          # x, along the worm, goes to -y
-    stands = Stance.of(model.template, lying)
-    assert np.allclose(stands.up, [0, -1, 0]) and abs(stands.front @ stands.up) < 1e-9
 
 
 def test_a_motion_wants_its_model(files, tmp_path):

@@ -8,22 +8,15 @@ from scanprep.pictures.page import Page
 
 
 class Reader(HTMLParser):
-    VOID = frozenset({"meta", "img", "br", "link"})
+    """Tags with their attributes, and words."""
 
     def __init__(self, text):
         super().__init__()
-        self.open, self.found, self.words = [], [], []
+        self.found, self.words = [], []
         self.feed(text)
-        self.close()
-        assert not self.open, self.open
 
     def handle_starttag(self, tag, attrs):
         self.found.append((tag, dict(attrs)))
-        if tag not in self.VOID:
-            self.open.append(tag)
-
-    def handle_endtag(self, tag):
-        assert self.open.pop() == tag
 
     def handle_data(self, data):
         self.words.append(data.strip())

@@ -48,15 +48,6 @@ def test_a_foreign_script_does_not_run_in_the_page(opened):
     assert opened.evaluate("window.bad") is None and any("Content Security Policy" in e for e in opened.errors)
 
 
-def test_wasm_and_workers_of_its_own_run_in_the_page(opened):
-    assert opened.evaluate("""async () => {
-      await WebAssembly.instantiate(new Uint8Array([0, 97, 115, 109, 1, 0, 0, 0]));
-      const worker = new Worker(URL.createObjectURL(new Blob(["postMessage(7)"])));
-      return new Promise((done) => { worker.onmessage = (event) => done(event.data); });
-    }""") == 7
-    assert not opened.errors
-
-
 def test_the_page_can_be_loaded_again_and_no_script_sees_the_token(opened, server):
     opened.reload()
     connected(opened)

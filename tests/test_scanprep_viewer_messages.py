@@ -18,12 +18,6 @@ def test_a_message_comes_back_from_its_frame(message):
     assert Message.unpack(message.pack()) == message
 
 
-@pytest.mark.parametrize("size", range(8))
-def test_data_lie_at_a_multiple_of_eight_bytes(size):
-    raw = Message("x" * (size + 1), data=b"data").pack()
-    assert (4 + struct.unpack_from("<I", raw)[0]) % 8 == 0
-
-
 def test_numbers_that_are_not_finite_are_null():
     raw = Message("a", {"x": math.nan, "y": [math.inf, 2], "z": np.array([1.0, np.nan])}).pack()
     assert b"NaN" not in raw and b"Infinity" not in raw

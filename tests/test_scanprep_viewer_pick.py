@@ -16,7 +16,7 @@ from scanprep.pipeline.pick import pick_landmarks
 from scanprep.synthetic.landmarks import landmarks
 from scanprep.synthetic.people import SyntheticPerson
 from scanprep.viewer.clicked import Clicked, camera_like, camera_of, predict_landmarks
-from scanprep.viewer.landmark_names import CAESAR, TEN, next_name, read_names
+from scanprep.viewer.landmark_names import TEN, read_names
 from scanprep.viewer.messages import Message
 from scanprep.viewer.pick import PickApp
 from scanprep.viewer.surface_clicks import Clickable
@@ -97,14 +97,6 @@ def test_clouds_are_clicked_point_by_point_and_the_nearest_one_wins():
     found = Clickable(points).hit(np.array([0.0, 0, 5]), np.array([0.0, 0, -1]))
     assert found[2] > 0.9 and (found == points).all(axis=1).any()
     assert Clickable(points).hit(np.array([3.0, 0, 5]), np.array([0.0, 0, -1])) is None
-
-
-def test_names_are_offered_the_other_side_first():
-    assert len(CAESAR) == 73 == len(set(CAESAR)) and len(TEN) == 10
-    assert next_name(TEN, {"left toe"}, "left toe") == "right toe"
-    assert next_name(TEN, {"left toe", "right toe"}, "right toe") == "left elbow outside"
-    assert next_name(TEN, set(TEN), "navel") is None
-    assert next_name(CAESAR, {"Rt. ASIS"}, "Rt. ASIS") == "Lt. ASIS"
 
 
 def test_lists_of_names_come_from_a_file(tmp_path):
@@ -414,19 +406,6 @@ def test_left_right_left_right_as_in_wrap_and_meshlab(folder, person):
         (crown, 0), (navel, None), (navel, 0), (left, None)]
     assert clicked(app, person, (1, left), (0, left))[-1][0] == TEN[3]         # also the scan first
     assert set(app.template.places) == set(app.scans[0].places) == {crown, navel, left}
-
-
-def test_all_on_the_template_first_works_too(folder, person):
-    (folder / "template.landmarks.json").unlink()
-    app = app_of(folder)
-    for name in TEN[:4]:
-        click_at(app, person, 0, name)
-    assert list(app.template.places) == list(TEN[:4])
-    for name in TEN[:4]:
-        np.testing.assert_allclose(app.template.places[name], person.mesh.vertices[landmarks()[name]], atol=0.05)
-    sent(app, "choose", name=TEN[0])                                           # chosen by hand, it is placed anew
-    click(app, person.mesh.vertices[landmarks()["navel"]] + [0, 0, 0.1], app.chosen, 0)
-    assert set(app.template.places) == set(TEN[:4])
 
 
 def test_names_that_a_file_has_under_other_words_are_not_offered_twice(folder):

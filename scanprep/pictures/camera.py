@@ -22,11 +22,11 @@ class Camera:
     vertical: np.ndarray  # (3,) float: unit vector that points away from the ground
     width: float  # metres: visible extent at the target
     height: float  # metres: visible extent at the target
-    distance: float = np.inf  # metres: from the camera to the target; inf for parallel rays
+    distance: float  # metres: from the camera to the target
 
     @classmethod
     def around(cls, subject: Any, azimuth: float = 0.0, elevation: float = 8.0,
-               up: int = 2, lens: float = 6.0, margin: float = 1.06) -> Camera:
+               up: int = 2, margin: float = 1.06) -> Camera:
         """Make a camera that sees the whole subject: meshes, solids, or points (n, 3); two points are corners of a box.
 
         Parameters
@@ -39,8 +39,6 @@ class Camera:
             Height of the camera above the horizontal.
         up : 0, 1 or 2
             Axis that points up.
-        lens : float
-            Distance of the camera in sizes of the subject; inf for parallel rays.
         margin : float
             Extent of the picture over that of the subject.
 
@@ -50,12 +48,13 @@ class Camera:
         """
         a = np.radians(azimuth)
         vertical, first, second = np.eye(3)[[up, (up + 1) % 3, (up + 2) % 3]]
-        return cls.from_side(subject, np.cos(a) * first + np.sin(a) * second, vertical, elevation, lens, margin)
+        return cls.from_side(subject, np.cos(a) * first + np.sin(a) * second, vertical, elevation, margin)
 
     @classmethod
-    def from_side(cls, subject: Any, side: np.ndarray, vertical: np.ndarray, elevation: float = 8.0, lens: float = 6.0,
+    def from_side(cls, subject: Any, side: np.ndarray, vertical: np.ndarray, elevation: float = 8.0,
                   margin: float = 1.06) -> Camera:
         """Make a camera as `around`, seen from the direction `side` (3,), with the unit vector `vertical` (3,) up."""
+        lens = 6.0  # distance of the camera in sizes of the subject: little perspective, as of a long lens
         points, e = _points(subject), np.radians(elevation)
         middle = (points.min(axis=0) + points.max(axis=0)) / 2
         flat = side - (side @ vertical) * vertical
@@ -66,18 +65,16 @@ class Camera:
         size = max(float(np.linalg.norm(points.max(axis=0) - points.min(axis=0))), 1e-9)
         x, y, depth = ((points - middle) @ axes.T).T
         # perspective enlarges what is nearer; then centre the picture on what is visible
-        if np.isfinite(lens):
-            nearer = lens * size / (lens * size - depth)
-            x, y = x * nearer, y * nearer
+        nearer = lens * size / (lens * size - depth)
+        x, y = x * nearer, y * nearer
         centre = middle + axes[0] * (x.min() + x.max()) / 2 + axes[1] * (y.min() + y.max()) / 2
         return cls(centre, axes, vertical, margin * max(float(np.ptp(x)), 1e-3 * size),
                    margin * max(float(np.ptp(y)), 1e-3 * size), lens * size)
 
     @property
     def position(self) -> np.ndarray:
-        """(3,) float, metres: where the camera is; for parallel rays, a point far outside the scene."""
-        away = self.distance if np.isfinite(self.distance) else 10 * (self.width + self.height)
-        return self.target + away * self.axes[2]
+        """(3,) float, metres: where the camera is."""
+        return self.target + self.distance * self.axes[2]
 
     def rays(self, width: int, height: int, samples: int = 1) -> tuple[np.ndarray, np.ndarray]:
         """Compute origins, relative to the target, and unit directions of the rays of a picture, row by row.
@@ -90,20 +87,14 @@ class Camera:
         down = (height * samples / 2 - np.arange(height * samples) - 0.5) * pixel
         right, up, back = self.axes.astype(np.float32)
         on_plane = (down.astype(np.float32)[:, None, None] * up + across.astype(np.float32)[:, None] * right)
-        on_plane = on_plane.reshape(-1, 3)
-        if not np.isfinite(self.distance):
-            # parallel rays begin far outside the scene
-            far = np.float32(10 * (self.width + self.height))
-            origins = on_plane + far * back
-            return origins, np.broadcast_to(-back, origins.shape)
-        directions = on_plane - np.float32(self.distance) * back
+        directions = on_plane.reshape(-1, 3) - np.float32(self.distance) * back
         directions /= np.sqrt(np.einsum("nd,nd->n", directions, directions))[:, None]
         return np.broadcast_to(np.float32(self.distance) * back, directions.shape), directions
 
     def project(self, points: np.ndarray, width: int, height: int) -> np.ndarray:
         """Project points (n, 3) into a picture: (n, 2) column and row in pixels."""
         x, y, depth = ((np.asarray(points) - self.target) @ self.axes.T).T
-        nearer = self.distance / (self.distance - depth) if np.isfinite(self.distance) else 1.0
+        nearer = self.distance / (self.distance - depth)
         pixel = max(self.width / width, self.height / height)
         return np.stack([width / 2 + x * nearer / pixel, height / 2 - y * nearer / pixel], axis=1)
 

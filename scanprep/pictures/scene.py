@@ -126,8 +126,7 @@ class _Columns:
 
 def _camera(camera: Camera) -> dict[str, Any]:
     """Describe a camera that looks at the origin."""
-    away = camera.distance if np.isfinite(camera.distance) else 6 * (camera.width + camera.height)
-    return {"target": [0, 0, 0], "back": camera.axes[2].tolist(), "distance": away,
+    return {"target": [0, 0, 0], "back": camera.axes[2].tolist(), "distance": camera.distance,
             "up": camera.vertical.tolist(), "width": camera.width, "height": camera.height}
 
 

@@ -61,11 +61,11 @@ def page(title: str, name: str, script: str, style: str, server: str, nonce: str
 
 
 def policy(nonce: str) -> str:
-    """Return the Content-Security-Policy of the page: own scripts and workers only, nothing from other machines."""
+    """Return the Content-Security-Policy of the page: own scripts only, nothing from other machines."""
     return "; ".join((
-        "default-src 'none'", f"script-src 'nonce-{nonce}' 'wasm-unsafe-eval'", "worker-src blob:",
+        "default-src 'none'", f"script-src 'nonce-{nonce}'",
         f"style-src-elem 'nonce-{nonce}'", "style-src-attr 'unsafe-inline'", "img-src 'self' data: blob:",
-        "connect-src 'self' data: blob:", "media-src blob:", "font-src data:",
+        "connect-src 'self'",
         "base-uri 'none'", "form-action 'none'", "frame-ancestors 'none'"))
 
 

@@ -221,7 +221,8 @@ class Request(BaseHTTPRequestHandler):
     server: Door
     protocol_version = "HTTP/1.1"
     timeout = 60                         # seconds that a connection may be silent
-    disable_nagle_algorithm = True       # else headers and body of an answer wait for each other
+    disable_nagle_algorithm = True       # else the end of an answer waits
+    wbufsize = -1                        # headers and body leave together
 
     def do_GET(self) -> None:
         """Answer with the page."""
