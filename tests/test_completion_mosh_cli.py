@@ -219,6 +219,14 @@ def test_a_table_says_who_is_who(tmp_path, ending):
     assert names(found) == {"u": ["2", "x_1"], "v": ["y_1"]}
 
 
+@pytest.mark.parametrize("count, rate, step", [(1, 120, 4), (500, 25, 1), (494, 60, 2), (2751, 120, 4),
+                                               (10**5, 120, 50), (10**5 + 1, 25, 51)])
+def test_a_page_plays_no_more_frames_than_it_can_carry(count, rate, step):
+    motion = Motion(np.zeros((count, 1, 3)), np.zeros((count, 3)), None, rate, np.zeros((count, 0)))
+    frames, shown = frames_to_play(motion)
+    assert frames[1:2].tolist() == [step][:count - 1] and shown == rate / step and len(frames) <= 2000
+
+
 @pytest.mark.slow
 def test_the_model_of_the_sex_that_the_markers_tell(place, tmp_path):
     model = worm_with_prior()

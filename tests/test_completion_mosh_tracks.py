@@ -24,19 +24,6 @@ def tracked(positions):
 
 # ---- tracks
 
-def test_a_track_of_constant_acceleration_does_not_jump():
-    t = np.arange(60)[:, None, None] / RATE
-    positions = np.broadcast_to(8 * t**2 + [1.0, 2.0, 3.0] * t, (60, 1, 3)).copy()
-    tracks = Tracks(positions, RATE)
-    assert np.nanmax(tracks.off[4:-4]) < 1e-12 and not tracks.jumped.any()
-    positions[30:] += [0.0, 0.02, 0.0]
-    tracks = Tracks(positions, RATE)
-    assert np.flatnonzero(tracks.jumped[:, 0]).tolist() == [30] and abs(tracks.off[30, 0] - 0.02) < 1e-12
-    positions[30:34] = np.nan
-    tracks = Tracks(positions, RATE)
-    assert not tracks.jumped.any() and np.flatnonzero(tracks.open[:, 0]).tolist() == [0, 30, 31, 32, 33, 34]
-
-
 def test_over_a_gap_a_track_may_have_been_accelerated():
     """Half squared deviations, and three times the logarithm by which they have grown: 2 mm a frame, 10 m/s² unseen."""
     positions = np.zeros((60, 1, 3))
