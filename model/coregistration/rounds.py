@@ -168,7 +168,8 @@ def coregister(model: BodyModel, scans: Sequence[Scan], landmarks: Sequence[Land
     labels = [f"scan {i}" for i in range(n)] if names is None else list(names)
     marks = list(landmarks) if landmarks is not None else [None for _ in scans]
     before: list[np.ndarray | None] = list(starts) if starts is not None else [None for _ in scans]
-    own, failed, changes = _own(subjects, n), list[int](), list[float]()
+    own = _own(subjects, n)
+    failed, changes = list[int](), list[float]()
     good, registrations, failures = np.zeros(n, dtype=bool), list[ModelRegistration | None](), dict[str, str]()
     with workspace_or_temporary(space) as kept:
         while len(changes) < config.rounds and not _has_settled(changes, model):
