@@ -352,13 +352,6 @@ def test_the_sex_is_told_by_measures(built_in):
     assert made.sex_probability == pytest.approx(density[made.sex] / sum(density.values()), abs=0.02)
 
 
-def test_what_people_with_the_other_measures_have(built_in):
-    made = body_with_measurements(*built_in, {"stature": 1.75, "waist": 0.6, "hip": 1.3}, "female")
-    assert made.missed and made.oddest == "hip_girth"
-    low, high = made.usual["hip_girth"]
-    assert 0.75 < low < high < 1.05 and np.isfinite(made.betas).all()
-
-
 def test_chests_as_high_as_the_armpits(built_in):
     """The fold behind the arm is no chest: it once added up to 25 cm to a quarter of the women."""
     model, tapes = built_in

@@ -234,13 +234,6 @@ def test_a_scan_in_millimetres_on_a_floor_becomes_a_body_in_metres(person, tmp_p
     assert any("mm" in str(row.value) for row in rows) and any("floor" in row.name for row in rows)
 
 
-def test_what_is_done_is_not_done_again(made, capsys):
-    before = (made / "statue" / "statue.glb").stat().st_mtime_ns
-    assert run("fit", made / "scan.ply", "-o", made / "statue", "--features", made / "features.json", "--unit", "mm",
-               "--size", 512, "--own-mesh", "--names", "unity") == 0
-    assert (made / "statue" / "statue.glb").stat().st_mtime_ns == before
-
-
 def test_a_statue_leaves_its_joints_to_be_mended_in_the_unit_of_its_scan(made, person):
     joints = read_landmarks(made / "statue" / "features.json", unit="mm")
     assert {"nose tip", "top of head", *JOINTS} <= set(joints)
