@@ -4,8 +4,6 @@ from derivatives import differences
 from model_bodies import random_poses, worm_model
 
 from model.fitting.vertices import FitConfig, _equations, fit_pose, fit_shape, share_of_vertices, spread_vertices
-from model.scape import ScapeModel
-from model.shape_space import ShapeSpace
 from scanprep.geometry import rotations
 
 
@@ -97,10 +95,3 @@ def test_refuses_bad_vertices(model, vertices, word):
         fit_pose(model.subject(), vertices)
     with pytest.raises(ValueError, match=word):
         fit_shape(model, vertices)
-
-
-def test_refuses_a_model_without_shapes(model):
-    none = ShapeSpace.empty(len(model.template.faces))
-    alone = ScapeModel(model.template, model.skeleton, model.pose_space, none, np.zeros((4, 3)), np.eye(12))
-    with pytest.raises(ValueError, match="n_betas"):
-        fit_shape(alone, model.template.vertices)

@@ -1,7 +1,6 @@
 import numpy as np
 import pytest
 from conformance_bodies import KINDS
-from derivatives import differences
 from model_bodies import random_poses, worm_model
 
 from model.body import BodyModel
@@ -31,14 +30,3 @@ def test_every_kind_of_model_goes_backwards(kind):
     by_pose, by_betas = model.pull_back(force, pose, betas)
     np.testing.assert_allclose(by_pose, np.tensordot(force, full.pose, axes=2), atol=1e-5)
     np.testing.assert_allclose(by_betas, np.tensordot(force, full.betas, axes=2), atol=1e-5)
-
-
-def test_gradient_is_the_finite_difference(model):
-    rng = np.random.default_rng(1)
-    pose, betas = random_poses(model, 1, rng)[0], rng.normal(size=3)
-    force = rng.normal(size=model.template.vertices.shape)
-    by_pose, by_betas = model.pull_back(force, pose, betas)
-    def value(pose, betas):
-        return float((force * model.vertices(pose, betas)).sum())
-    np.testing.assert_allclose(by_pose, differences(lambda x: value(x, betas), pose), rtol=1e-6, atol=1e-5)
-    np.testing.assert_allclose(by_betas, differences(lambda b: value(pose, b), betas), rtol=1e-6, atol=1e-5)

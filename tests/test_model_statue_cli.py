@@ -14,7 +14,6 @@ from model import load_model
 from model.export.bvh import write_bvh
 from model.statue import commands, report
 from model.statue.commands import read_scan
-from model.statue.control.files import humanoid
 from model.statue.control.model import HOLE, MEASURED, OUTSIDE
 from model.statue.detail.reconstruction import Level
 from model.statue.files import load_statue
@@ -24,11 +23,9 @@ from model.statue.registration.features import FeatureFit
 from model.statue.verdict import judge_statue
 from scanprep import Mesh, read_mesh, write_mesh
 from scanprep.geometry.format_glb import turn_up
-from scanprep.geometry.landmark_names import FACE
 from scanprep.geometry.landmarks import read_landmarks
 from scanprep.pipeline.scans import ScanTask
 from scanprep.synthetic.people import LANDMARKS, BodyShape, SyntheticPerson, synthesise_walk
-from scanprep.viewer.landmark_names import HUMANOID
 
 JOINTS = {"vl5": 1, "skullbase": 3, "l_shoulder": 4, "l_elbow": 5, "l_wrist": 6, "r_shoulder": 7, "r_elbow": 8,
           "r_wrist": 9, "l_hip": 10, "l_knee": 11, "l_ankle": 12, "r_hip": 13, "r_knee": 14, "r_ankle": 15}
@@ -180,7 +177,7 @@ def test_a_walk_moves_the_statue(made, tmp_path):
     assert run("animate", made / "statue", tmp_path / "walk.bvh", "-o", tmp_path / "walking", "--level", 1,
                "--meshes") == 0
     found = figures(tmp_path / "walking" / "report.json")
-    assert found["frames"] == 6 and (tmp_path / "walking" / "motion.gif").exists()
+    assert found["frames"] == 6
     body = read_mesh(tmp_path / "walking" / "meshes" / "00003.ply")
     assert body.is_closed and 1.6 < np.ptp(body.vertices, axis=0).max() < 1.9
     # the motion that was written is one of the statue's own parts, and gives the same meshes again
@@ -237,13 +234,6 @@ def test_a_scan_in_millimetres_on_a_floor_becomes_a_body_in_metres(person, tmp_p
     assert any("mm" in str(row.value) for row in rows) and any("floor" in row.name for row in rows)
 
 
-def test_what_is_done_is_not_done_again(made, capsys):
-    before = (made / "statue" / "statue.glb").stat().st_mtime_ns
-    assert run("fit", made / "scan.ply", "-o", made / "statue", "--features", made / "features.json", "--unit", "mm",
-               "--size", 512, "--own-mesh", "--names", "unity") == 0
-    assert (made / "statue" / "statue.glb").stat().st_mtime_ns == before
-
-
 def test_a_statue_leaves_its_joints_to_be_mended_in_the_unit_of_its_scan(made, person):
     joints = read_landmarks(made / "statue" / "features.json", unit="mm")
     assert {"nose tip", "top of head", *JOINTS} <= set(joints)
@@ -273,8 +263,3 @@ def test_a_refused_figure_opens_with_what_was_found_and_may_be_fitted_there(pers
     told = " ".join(capsys.readouterr().err.split())
     assert f"expected at least three joints or points, got 1; click more: scape pick {scan} --joints" in told
     assert "--features" not in told.split("got 1")[1]
-
-
-def test_the_names_offered_to_be_clicked_are_those_of_the_humanoid():
-    control = humanoid()
-    assert set(HUMANOID) == {*control.skeleton.names[1:], *FACE} and set(FACE) <= set(control.landmarks)

@@ -2,7 +2,6 @@
 import json
 import struct
 from dataclasses import replace
-from fractions import Fraction
 
 import numpy as np
 import pytest
@@ -18,21 +17,17 @@ from model.statue.control.chart import (
     Chart,
     automatic_chart,
     chart_problem,
-    crossings,
-    cut,
     densities,
     make_chart,
-    orientation,
 )
-from model.statue.control.files import STORED, humanoid, humanoid_markers, read_control, write_control
+from model.statue.control.files import STORED, humanoid, read_control, write_control
 from model.statue.control.model import control_problem
 from model.statue.files import load_statue
 from model.statue.motion.motions import people_motion
 from scanprep import write_mesh
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.storage import StorageError
-from scanprep.synthetic.people import LANDMARKS, MARKERS, SyntheticPerson, find_pose
-from scanprep.synthetic.topology import load_topology
+from scanprep.synthetic.people import SyntheticPerson, find_pose
 
 MIRROR = np.array([-1, 1, 1])
 
@@ -145,34 +140,6 @@ def test_a_positive_angle_moves_a_limb_as_its_name_says(joint, axis, towards):
         assert moved @ way > 0.6 * np.linalg.norm(moved)
 
 
-def test_the_joints_lie_inside_and_every_part_carries_what_is_near():
-    import igl
-
-    control = humanoid()
-    mesh, joints = control.mesh, control.skeleton.joints
-    assert np.allclose(igl.winding_number(mesh.vertices, mesh.faces, joints), 1, atol=1e-6)
-    in_root = control.skeleton.part_of_vertex(mesh) == 0
-    np.testing.assert_allclose(joints[0], mesh.vertices[in_root].mean(axis=0), atol=1e-12)
-    regressor = control.skeleton.joint_regressor(mesh)
-    np.testing.assert_allclose(regressor @ mesh.vertices, joints, atol=1e-9)
-    assert np.abs(regressor.toarray()).max() < 0.5                  # no joint is reached by extrapolation
-    assert (control.weights > 0).sum(axis=1).max() <= 4
-    x, y = mesh.edges.T                                             # smooth: neighbours are carried alike
-    assert np.abs(control.weights[x] - control.weights[y]).sum(axis=1).max() / 2 < 0.75
-    pose = np.zeros((17, 3))
-    np.testing.assert_allclose(control.rig.vertices(pose), mesh.vertices, atol=1e-12)
-
-
-def test_landmarks_and_markers_are_where_people_have_them():
-    control, people = humanoid(), load_topology()
-    assert set(control.landmarks) == set(LANDMARKS) and set(humanoid_markers()) == set(MARKERS)
-    for mine, theirs in ((control.landmarks, LANDMARKS), (humanoid_markers(), MARKERS)):
-        assert len(set(mine.values())) == len(mine)
-        for name, vertex in mine.items():
-            away = np.linalg.norm(control.mesh.vertices[vertex] - people.mesh.vertices[theirs[name]])
-            assert away < 0.015, name                            # not where people have ears and toes
-
-
 def test_the_chart_is_one_to_one_and_even():
     control = humanoid()
     assert chart_problem(control.mesh, control.chart) is None
@@ -185,30 +152,6 @@ def test_the_chart_is_one_to_one_and_even():
     back = np.einsum("nc,ncd->nd", bary, control.chart.uv[control.chart.faces[faces]])
     centres = np.column_stack([columns + 0.5, 300 - rows - 0.5]) / 300
     np.testing.assert_allclose(back, centres, atol=1e-12)
-    inside = np.zeros((300, 300), dtype=bool)                       # even-odd rule on the border, point by point
-    inside[rows, columns] = True
-    loop = control.chart.uv[control.chart.flat.boundary_loops[0]]
-    a, b = loop, np.roll(loop, -1, axis=0)
-    x, y = (np.random.default_rng(0).integers(0, 300, (400, 2)) + 0.5).T / 300
-    across = (a[:, 1] > y[:, None]) != (b[:, 1] > y[:, None])
-    with np.errstate(divide="ignore", invalid="ignore"):
-        at = a[:, 0] + (y[:, None] - a[:, 1]) / (b[:, 1] - a[:, 1]) * (b[:, 0] - a[:, 0])
-    wanted = (across & (at > x[:, None])).sum(axis=1) % 2 == 1
-    assert (inside[(300 - 300 * y).astype(int), (300 * x).astype(int)] == wanted).all()
-
-
-def test_signs_of_areas_and_crossings_are_exact():
-    rng = np.random.default_rng(1)
-    a, b = rng.random((2, 60, 2))
-    c = a + rng.random((60, 1)) * (b - a)                           # on the line but for rounding
-    exact = [np.sign((Fraction(q[0]) - Fraction(p[0])) * (Fraction(r[1]) - Fraction(p[1]))
-                     - (Fraction(q[1]) - Fraction(p[1])) * (Fraction(r[0]) - Fraction(p[0])))
-             for p, q, r in zip(a.tolist(), b.tolist(), c.tolist(), strict=True)]
-    np.testing.assert_array_equal(orientation(a, b, c), np.array(exact, dtype=int))
-    assert len(set(exact)) > 1
-    square = np.array([[0, 0], [1, 0], [1, 1], [0, 1.0]])
-    assert not crossings(square) and crossings(square[[0, 2, 1, 3]])
-    assert crossings(np.array([[0, 0], [2, 0], [2, 1], [1, 0], [0, 1.0]]))      # touches a side with a corner
 
 
 def test_a_chart_that_is_not_one_to_one_is_told():
@@ -338,19 +281,6 @@ def test_an_open_control_mesh_is_closed(glb):
     assert again.mesh.is_closed and len(again.mesh.faces) == len(humanoid().mesh.faces)
 
 
-def test_for_texture_coordinates_in_two_charts_one_is_made(glb):
-    control = humanoid()
-    faces, vertex = cut(control.mesh, [])
-    half = control.mesh.corners[:, :, 0].mean(axis=1) > 0
-    faces = np.where(half[:, None], faces + len(vertex), faces)
-    uv = np.vstack([control.mesh.vertices[vertex][:, [0, 2]] / 4 + [0.2, 0.1],
-                    control.mesh.vertices[vertex][:, [0, 2]] / 4 + [0.7, 0.1]])
-    used, faces = np.unique(faces, return_inverse=True)
-    with pytest.warns(UserWarning, match=r"changed\.glb.*a chart is made.*2 charts"):
-        again = read_control(with_uv(glb, Chart(uv[used], faces.reshape(-1, 3)), control.mesh))
-    assert chart_problem(again.mesh, again.chart) is None
-
-
 def with_eyes(path, pose=None):
     """A skinned GLB of the humanoid in a pose, with two eyes as components of their own; no landmarks."""
     control = humanoid()
@@ -366,14 +296,6 @@ def with_eyes(path, pose=None):
         rig = replace(rig, mesh=mesh, skeleton=skeleton, weights=np.vstack([rig.weights, np.eye(17)[[head] * m]]),
                       shapes=np.zeros((0, n + m, 3)))
     write_skinned_glb(path, rig)
-
-
-def test_eyes_of_a_control_model_are_left_out_and_said(tmp_path):
-    with_eyes(tmp_path / "eyes.glb")
-    with pytest.warns(UserWarning, match=r"eyes\.glb: left out 2 small components"):
-        again = read_control(tmp_path / "eyes.glb")
-    assert len(again.mesh.faces) == len(humanoid().mesh.faces) and again.skeleton.names == NAMES
-    assert chart_problem(again.mesh, again.chart) is None
 
 
 @pytest.mark.slow

@@ -11,10 +11,9 @@ from model.rig import turn_up
 from model.statue.control.chart import Chart
 from model.statue.control.files import humanoid
 from model.statue.detail.subdivision import subdivide_uniform
-from model.statue.detail.texels import chart_tangents, normal_image, vertex_of_row
+from model.statue.detail.texels import normal_image, vertex_of_row
 from model.statue.files import ABOUT, KIND, load_statue, write_statue_glb
 from model.statue.motion.motions import people_motion
-from scanprep.geometry import rotations
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.storage import StorageError
 from scanprep.synthetic.people import synthesise_walk
@@ -101,18 +100,6 @@ def test_the_control_mesh_with_images_of_detail(detailed, tmp_path):
     flat = np.einsum("nd,nd->n", N, exact[rows, columns]) / np.linalg.norm(N, axis=1)
     assert np.degrees(np.arccos(np.clip(np.percentile(cosine, 1), -1, 1))) < 2
     assert np.degrees(np.arccos(np.clip(np.median(flat), -1, 1))) > 5, "there is detail that the mesh has not"
-
-
-def test_tangents_go_along_the_rows_of_the_image():
-    mesh = Mesh(np.array([[0, 0, 0], [2, 0, 0], [2, 1, 0], [0, 1, 0.0]]), np.array([[0, 1, 2], [0, 2, 3]]))
-    turn = rotations.exp(np.array([0.3, -1, 2]))
-    for uv, direction, sign in ((mesh.vertices[:, :2] / 2, [1, 0, 0], 1), (1 - mesh.vertices[:, :2] / 2, [-1, 0, 0], 1),
-                                (mesh.vertices[:, [1, 0]] / 2, [0, 1, 0], -1)):
-        found = chart_tangents(mesh.with_vertices(mesh.vertices @ turn.T), Chart(uv, mesh.faces))
-        assert np.abs(found[:, :3] - turn @ direction).max() < 1e-12 and (found[:, 3] == sign).all()
-        upwards = turn.T @ np.cross(turn[:, 2], found[0, :3]) * sign
-        grows = np.linalg.lstsq(mesh.vertices[:, :2], uv[:, 1] - uv[0, 1], rcond=None)[0]
-        assert upwards[:2] @ grows > 0.4, "the way in which v grows"
 
 
 @pytest.mark.parametrize("about, words", [

@@ -13,7 +13,6 @@ from trimesh.visual import TextureVisuals
 from trimesh.visual.material import PBRMaterial
 
 from completion.__main__ import main
-from model.export.names import names_of
 from model.statue.commands import read_scan
 from model.statue.control.files import humanoid, write_control
 from model.statue.control.model import MEASURED, DisplacementMap, Statue
@@ -108,11 +107,6 @@ def test_vertices_stand_where_they_stood_and_materials_stay(file, written):
     np.testing.assert_array_equal(before.array(old["indices"]), after.array(new["indices"]))
     normals = after.array(new["attributes"]["NORMAL"])
     np.testing.assert_allclose(normals, before.array(old["attributes"]["NORMAL"]) @ TURN[:3, :3].T, atol=1e-5)
-
-
-def test_bones_have_the_names_that_were_asked_for(written):
-    known = names_of(HUMAN.skeleton, "unity")
-    assert SkinnedFile(written[0]).bones == [known[name] for name in NAMES] and len(set(known)) == len(NAMES)
 
 
 def test_a_squat_moves_skin_as_the_statue_and_props_stiffly(file, written, statue, tmp_path):

@@ -7,7 +7,6 @@ import trimesh
 
 from model.statue.control.files import humanoid
 from model.statue.registration.automatic import find_features
-from model.statue.registration.person_search import control_body
 from model.statue.registration.sketch import sketch_joints
 from scanprep.geometry import rotations
 from scanprep.geometry.mesh import Mesh
@@ -51,14 +50,6 @@ def test_joints_of_a_person_are_sketched_in_any_axes(person):
 def test_what_has_no_limbs_is_not_sketched(shape):
     with pytest.raises(ValueError, match="no star of five tips"):
         sketch_joints(Mesh(shape.vertices, shape.faces))
-
-
-def test_a_body_of_odd_proportions_has_the_same_mean_and_wider_betas():
-    usual, odd = control_body(humanoid()), control_body(humanoid(), 0.3, 0.08)
-    lengths, girths = np.split(np.arange(1, len(usual.shape_components)), 2)
-    np.testing.assert_array_equal(usual.shape_mean, odd.shape_mean)
-    np.testing.assert_allclose(odd.shape_components[lengths], 0.3 / 0.08 * usual.shape_components[lengths])
-    np.testing.assert_allclose(odd.shape_components[girths], 0.08 / 0.02 * usual.shape_components[girths])
 
 
 @pytest.mark.slow

@@ -3,7 +3,6 @@ import numpy as np
 import pytest
 from derivatives import slope
 from scanned_shapes import distortion
-from scipy.sparse import csc_array, diags_array, eye_array
 from scipy.spatial import ConvexHull
 from scipy.special import logsumexp
 
@@ -11,10 +10,8 @@ from model.statue.fit import spread_flat
 from model.statue.registration.local_shape import local_shape
 from model.statue.registration.soft_assignment import DirectedPoints, assign_softly
 from model.statue.registration.surface_fit import fit_surface
-from scanprep.alignment.icp import align_landmarks, apply
 from scanprep.geometry import rotations
 from scanprep.geometry.mesh import Mesh, template_problem
-from scanprep.geometry.sparse import Factored, conjugate_gradients
 from scanprep.geometry.surface import Surface
 
 
@@ -40,17 +37,6 @@ def bumpy(p: np.ndarray) -> np.ndarray:
 def body() -> Mesh:
     mesh = ball(300, 1)
     return mesh.with_vertices(bumpy(mesh.vertices))
-
-
-def restored(shape, x, steps):
-    """Gauss-Newton on the local shape alone."""
-    w = shape.weights[:, None]
-    K = shape.plane.T @ diags_array(shape.weights) @ shape.plane
-    nearly = Factored(csc_array(K + 1e-6 * eye_array(shape.count)))
-    for _ in range(steps):
-        x = x + conjugate_gradients(lambda d, x=x: shape.apply_transpose(x, w * shape.derivative(x, d)) + 1e-9 * d,
-                                    -shape.gradient(x) / 2, nearly.solve, 200)
-    return x
 
 
 def test_every_similar_copy_of_the_rest_shape_is_at_rest(body):
@@ -98,22 +84,6 @@ def test_borders_and_flat_frames_hold_nothing(body):
     assert np.isfinite(shape.gradient(pointed.vertices + 0.01)).all()
     with pytest.raises(ValueError, match="three sides"):
         local_shape(Mesh(np.eye(3), np.array([[0, 1, 2]])))
-
-
-def test_the_constraint_alone_takes_noise_away(body):
-    """[Statues] Fig. 6: exactly by the exact energy; the published evolution is quick, then very slow."""
-    shape, x = local_shape(body), body.vertices
-    noisy = x + 0.1 * body.mean_edge * np.random.default_rng(3).standard_normal(x.shape)
-
-    def off(y):
-        return np.sqrt(np.mean((apply(align_landmarks(y, x, scale=True).T_target_source, y) - x) ** 2))
-
-    y = noisy
-    for _ in range(200):
-        y = y + 0.5 * shape.paper_force(y)                # Eq. 12
-    assert shape.energy(y) < 0.02 * shape.energy(noisy)
-    assert off(y) < 0.5 * off(noisy)
-    assert off(restored(shape, noisy, 6)) < 1e-3 * off(noisy)
 
 
 @pytest.mark.parametrize("published", [False, True])

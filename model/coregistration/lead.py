@@ -62,9 +62,8 @@ class ModelLead:
             nearest = self.carrier.bary[landmarks[0]].argmax(axis=1)
             marked = self.carrier.corners[landmarks[0], nearest], landmarks[1]
         body_model = model_at(self.name if model is None else model)
-        for found in find_bodies(body_model, scan, marked, None if up is None else direction_of(up)):
-            worn = found.not_skin
-            yield Proposal(self.carrier.positions(found.mesh.vertices), None if worn is None else worn.points,
+        for body, worn in find_bodies(body_model, scan, marked, None if up is None else direction_of(up)):
+            yield Proposal(self.carrier.positions(body.vertices), None if worn is None else worn.points,
                            () if worn is None else worn.places)
 
     def person_size(self, scan: Mesh | np.ndarray) -> tuple[float, float]:
@@ -118,8 +117,7 @@ def person_on(scan: Mesh | np.ndarray) -> tuple[Mesh, dict[str, int]] | None:
     # the search takes seconds: ask it only where the scan is as large as people are
     if unit_problem(extent(points), extent(model.template.vertices), "the scan is"):
         return None
-    for found in find_bodies(model, scan, only_if_near=True):        # an animal took half a minute
-        body = found.mesh
+    for body, _ in find_bodies(model, scan, only_if_near=True):        # an animal took half a minute
         size = float(np.sqrt(body.face_areas.sum()))
         # the scan lies on the body, but for clothes and hair, and shows most of it
         shown = cKDTree(points).query(body.vertices)[0] < 0.03 * size

@@ -7,7 +7,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -38,14 +37,6 @@ ALIKE, FAR, LOST = 0.015, 0.045, 0.005
 
 class ModelMismatchError(ValueError):
     """The model does not fit the template: it is of another kind of body."""
-
-
-@dataclass(frozen=True, eq=False)
-class FoundBody:
-    """A body on a scan, bent onto its skin, and the hair and clothes around it, if any."""
-
-    mesh: Mesh
-    not_skin: NotSkin | None
 
 
 def nearest_by_name(template: Mesh, laid: Mesh, names: Mapping[str, int]) -> dict[str, int]:
@@ -83,10 +74,10 @@ def lay_model(model: BodyModel, template: Mesh, progress: Callable[[int, int], N
     # largest shares of the template that is uncovered, and of the body that is stretched. A woman has 0.004 and 0.0002;
     # a crab has 0.005 and 0.088.
     other = 0.02, 0.05
-    for found in find_bodies(model, template):
+    for body, _ in find_bodies(model, template):
         report_progress(1, 2)
-        laid = register(found.mesh, template, start=found.mesh.vertices)
-        if laid.uncovered <= other[0] and share_stretched(found.mesh, laid.mesh) <= other[1]:
+        laid = register(body, template, start=body.vertices)
+        if laid.uncovered <= other[0] and share_stretched(body, laid.mesh) <= other[1]:
             report_progress(2, 2)
             return laid.mesh
     raise ModelMismatchError(f"the model does not come to lie on the template, {100 * laid.uncovered:.0f}% of which "
@@ -94,12 +85,13 @@ def lay_model(model: BodyModel, template: Mesh, progress: Callable[[int, int], N
 
 
 def find_bodies(model: BodyModel, scan: Mesh | np.ndarray, landmarks: Landmarks | None = None,
-                up: tuple[float, float, float] | None = None, only_if_near: bool = False) -> Iterator[FoundBody]:
+                up: tuple[float, float, float] | None = None, only_if_near: bool = False
+                ) -> Iterator[tuple[Mesh, NotSkin | None]]:
     """Yield likely bodies of a model on a scan, each bent onto it where there are data, and computed on demand.
 
-    Where the best one shows hair or clothes, the search is made again for a body inside them. First comes the best of
-    the typical poses. Then come the best after re-initialisation of limbs, and another body that explains the scan
-    nearly as well, where they differ.
+    With each comes what hair and clothes are around it, or None. Where the best one shows any, the search is made again
+    for a body inside them. First comes the best of the typical poses. Then come the best after re-initialisation of
+    limbs, and another body that explains the scan nearly as well, where they differ.
 
     Parameters
     ----------
@@ -126,10 +118,10 @@ def find_bodies(model: BodyModel, scan: Mesh | np.ndarray, landmarks: Landmarks 
         """Compute the predicted body of unknowns (P,) at its own size."""
         return model.template.with_vertices(body.vertices(fit.body.in_metres(x)[0]))
 
-    def bend(x: np.ndarray) -> FoundBody:
+    def bend(x: np.ndarray) -> tuple[Mesh, NotSkin | None]:
         """Let the surface of the body follow the scan; lengths there are those of the fit."""
         followed, *_ = free_surface(fit.mesh(x), fit.cloud)              # [SCAPE] Eq. 10, over Y
-        return FoundBody(followed.with_vertices(followed.vertices / factor), worn)
+        return followed.with_vertices(followed.vertices / factor), worn
 
     best = _solve(fit, coarse, starts[0])
     if only_if_near and coarse.find_unexplained(best, coarse.thin).mean() > ASTRAY:

@@ -25,7 +25,7 @@ from scanprep.geometry.landmarks import write_landmarks
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.sanitise import sanitise
 from scanprep.judgement import Judgement
-from scanprep.pictures.sheets import save_png, write_gif
+from scanprep.pictures.sheets import save_png
 from scanprep.pictures.textures import Texture, read_texture
 from scanprep.pipeline.scans import ScanTask, find_scans
 from scanprep.ranges import Positive
@@ -55,7 +55,7 @@ from .outer import cut_plinth, find_plinth, keep_outer
 from .own_mesh import OWN_MESH, animate_own_mesh, read_pieces, write_own_mesh
 from .registration.automatic import nearest_unit, person_unit
 from .registration.clicks import read_features
-from .report import in_motion, motion_pictures, parts_without_data, statue_page, statue_picture
+from .report import in_motion, parts_without_data, statue_page, statue_picture
 from .verdict import judge_statue
 
 FEATURES = "features.json"           # joints and points of the face of a statue, to be mended in scape pick --joints
@@ -314,7 +314,7 @@ def animate(statue: StatueArg, motion: MotionArg, output: Output, rate: Positive
         statue: Folder of scape statue fit.
         motion: .bvh, .npz with poses, trans and mocap_frame_rate, or .csv with time and PART_rx, PART_ry, PART_rz in
             degrees.
-        output: Folder to write: statue.glb, motion.npz with its model body.npz, motion.gif, and meshes on demand.
+        output: Folder to write: statue.glb, motion.npz with its model body.npz, and meshes on demand.
         rate: Frames a second, where the motion's file does not say or says it wrongly.
         level: Level of detail of the files.
         meshes: Write the exact mesh of every frame.
@@ -337,9 +337,6 @@ def animate(statue: StatueArg, motion: MotionArg, output: Output, rate: Positive
     rows = [Metric("joints that follow the motion", len(moved.matched)),
             *([Metric("joints without one in the motion", ", ".join(moved.lacking))] if moved.lacking else [])]
     shown = bodies[::max(1, len(bodies) // 24)]
-    with bar("rendering") as progress:
-        write_gif(output / "motion.gif", motion_pictures(loaded, detailed, shown, progress),
-                  moved.rate * len(shown) / len(bodies))
     if meshes:
         with bar("writing meshes") as progress:
             for t, body in enumerate(bodies):

@@ -1,7 +1,7 @@
 """The page of a statue: what was fitted, the map, the error at every level, and the character in motion."""
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -14,7 +14,7 @@ from scanprep.judgement import size
 from scanprep.pictures.camera import Camera
 from scanprep.pictures.page import Page
 from scanprep.pictures.scene import Pane, picture_panes
-from scanprep.pictures.shading import CLAY, Bones, Dots, Heat, Solid, part_colors, render
+from scanprep.pictures.shading import CLAY, Bones, Dots, Heat, Solid, part_colors
 from scanprep.pictures.sheets import webp_bytes
 from scanprep.pictures.thinning import MOST, thin_solid
 from scanprep.synthetic.people import find_pose, synthesise_walk
@@ -116,14 +116,3 @@ def in_motion(statue: Statue) -> list[tuple[str, Mesh]]:
     bodies = statue.control.rig.vertices(moved.poses, moved.trans)
     return [(name, detailed.mesh(body)) for name, body in zip(("walking", "squatting", "arms overhead"), bodies,
                                                               strict=True)]
-
-
-def motion_pictures(statue: Statue, detailed: Reconstruction, bodies: np.ndarray,
-                    progress: Callable[[int, int], None] | None = None) -> list[np.ndarray]:
-    """Picture frames of control vertices (T, N, 3), all from one camera in front."""
-    camera, out = place_camera(statue, bodies.reshape(-1, 3), 25), []
-    for t, body in enumerate(bodies):
-        out.append(render(detailed.mesh(body), camera, int(360 * camera.width / camera.height) + 10, 360))
-        if progress:
-            progress(t + 1, len(bodies))
-    return out

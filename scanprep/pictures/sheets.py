@@ -1,4 +1,4 @@
-"""Contact sheets of pictures, picture files, and animated GIFs."""
+"""Contact sheets of pictures, and picture files."""
 from __future__ import annotations
 
 import io
@@ -93,31 +93,3 @@ def small_picture(path: Path) -> bytes:
 def save_png(path: str | Path, image: np.ndarray) -> None:
     """Write a picture (H, W, 3) uint8, completely or not at all."""
     write_file(path, png_bytes(image))
-
-
-def gif_bytes(images: Sequence[np.ndarray], rate: float) -> bytes:
-    """Encode pictures (H, W, 3) uint8 as an endless animated GIF of `rate` pictures per second.
-
-    All share one palette, so that colours do not flicker.
-    """
-    from PIL import Image
-
-    if not len(images):
-        raise ValueError("images: expected at least one, got none")
-    # the palette is computed from about six of the pictures, at half their size
-    step = max(1, len(images) // 6)
-    palette = Image.fromarray(np.concatenate([i[::2, ::2] for i in images[::step]])).quantize(
-        255, method=Image.Quantize.MEDIANCUT)
-    colors = np.array(palette.getpalette()).reshape(-1, 3)
-    colors[colors.sum(axis=1).argmax()] = 255     # the lightest becomes white, the usual background
-    palette.putpalette(colors.ravel().tolist())
-    frames = [Image.fromarray(i).quantize(palette=palette, dither=Image.Dither.FLOYDSTEINBERG) for i in images]
-    out = io.BytesIO()
-    frames[0].save(out, format="GIF", save_all=True, append_images=frames[1:], loop=0,
-                   duration=max(20, round(1000 / rate / 10) * 10), optimize=False)
-    return out.getvalue()
-
-
-def write_gif(path: str | Path, images: Sequence[np.ndarray], rate: float) -> None:
-    """Write pictures as an animated GIF, completely or not at all."""
-    write_file(path, gif_bytes(images, rate))
