@@ -80,16 +80,16 @@ def test_links_at_every_name_that_a_command_writes(place, user, listener, monkey
 
 def test_a_copy_of_landmarks_is_kept_through_no_link(tmp_path, user):
     """One click on an unpacked scan has made a file of the user's, with text of the sender's."""
-    (tmp_path / "anna.landmarks.txt").write_text("0 0 0 $(touch gotcha)\n")
-    (tmp_path / "anna.landmarks.txt.before").symlink_to(user / ".bash_aliases")
-    one = Clicked(tmp_path / "anna.ply", tmp_path / "anna.landmarks.txt", "m")
+    (tmp_path / "anna.landmarks.csv").write_text("0 0 0 $(touch gotcha)\n")
+    (tmp_path / "anna.landmarks.csv.before").symlink_to(user / ".bash_aliases")
+    one = Clicked(tmp_path / "anna.ply", tmp_path / "anna.landmarks.csv", "m")
     one.places = {"head": np.zeros(3)}
-    with pytest.raises(storage.StorageError, match=r"anna\.landmarks\.txt\.before: .*found a link"):
+    with pytest.raises(storage.StorageError, match=r"anna\.landmarks\.csv\.before: .*found a link"):
         one.save()
-    assert (tmp_path / "anna.landmarks.txt").read_text().endswith("gotcha)\n")
-    (tmp_path / "anna.landmarks.txt.before").unlink()
+    assert (tmp_path / "anna.landmarks.csv").read_text().endswith("gotcha)\n")
+    (tmp_path / "anna.landmarks.csv.before").unlink()
     one.save()
-    assert "gotcha" in (tmp_path / "anna.landmarks.txt.before").read_text()
+    assert "gotcha" in (tmp_path / "anna.landmarks.csv.before").read_text()
 
 
 def test_the_names_of_unfinished_files_cannot_be_guessed(tmp_path, user):

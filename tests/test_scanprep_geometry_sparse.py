@@ -7,7 +7,7 @@ from scipy.sparse import csc_array, eye_array, random_array
 from scipy.spatial import ConvexHull
 
 from scanprep.geometry.mesh import Mesh
-from scanprep.geometry.sparse import Factored, factor, harmonic, solve_smooth
+from scanprep.geometry.sparse import Factored, conjugate_gradients, factor, harmonic, solve_smooth
 
 
 def system(n=80, seed=0):
@@ -68,3 +68,11 @@ def test_harmonic_values_are_means_of_their_neighbours():
     means = (two.vertex_adjacency @ filled) / two.vertex_adjacency.sum(axis=1)[:, None]
     np.testing.assert_allclose(filled[~untouched], means[~untouched], atol=1e-9)
     assert filled[~untouched].max() <= values[known].max() and filled[~untouched].min() >= values[known].min()
+
+
+def test_conjugate_gradients_end_after_as_many_steps_as_there_are_values():
+    rng = np.random.default_rng(5)
+    values, axes = np.geomspace(1, 100, 6), np.linalg.qr(rng.normal(size=(6, 6)))[0]
+    A, b, scale = axes * values @ axes.T, rng.normal(size=6), rng.uniform(0.5, 2, 6)
+    found = conjugate_gradients(lambda d: A @ d, b, lambda r: scale * r, 6, 1e-12)
+    np.testing.assert_allclose(A @ found, b, atol=1e-8)

@@ -179,12 +179,12 @@ def create_file(path: str | Path, data: bytes = b"") -> None:
         raise
 
 
-def keep_former(path: Path, ending: str = ".before") -> None:
+def keep_former(path: Path) -> None:
     """Copy a file beside itself before its first change; an earlier copy stays.
 
     StorageError for a link in the place of the copy: a copy would overwrite what it leads to.
     """
-    copy = path.with_name(path.name + ending)
+    copy = path.with_name(path.name + ".before")
     if copy.is_symlink():
         raise StorageError(f"{copy}: expected a copy of {path.name}, or nothing, found a link; remove it")
     with contextlib.suppress(FileExistsError):

@@ -46,8 +46,9 @@ def skeleton_doubts(skeleton: Skeleton, parts: int | None = None) -> list[str]:
     doubts = [f"the skeleton has no joint at the {', '.join(missing)}: add scans in which the body bends there"] \
         if missing else []
     if parts is not None and parts != len(skeleton.parents):
-        doubts.insert(0, f"no skeleton of {parts} parts was found, the nearest has {len(skeleton.parents)}: leave out "
-                         "--parts, or add scans in which the body bends at the joints that are missing")
+        doubts.insert(0, f"no skeleton of {parts} parts was found, the nearest has {len(skeleton.parents)}: ask "
+                         "for no number of parts (scape prep skeleton --parts), or add scans in which the body bends "
+                         "at the joints that are missing")
     return doubts
 
 
