@@ -149,8 +149,16 @@ def shape_space(people: Population, kept: np.ndarray, template: Mesh, space: Pos
     return ShapeSpace(mean, components.astype(np.float32), variances, float(variances.sum()))
 
 
+def pack_coefficients(space: PoseSpace) -> tuple[np.ndarray, np.ndarray]:
+    """Pack the coefficients of a pose space into 16 bits, with one unit (A,) a feature: a third of the bytes."""
+    scales = np.concatenate([np.abs(a).max(axis=(1, 2, 3)) for a in space.coefficients]) / (2**15 - 1)
+    scales = np.maximum(scales, np.finfo(np.float32).tiny)
+    numbers = [a / scales[space.features.of_part(p)][:, None, None, None] for p, a in enumerate(space.coefficients)]
+    return np.concatenate([np.round(a).astype(np.int16).ravel() for a in numbers]), scales
+
+
 def unpack_coefficients(features: PoseFeatures, packed: np.ndarray, scales: np.ndarray) -> tuple[np.ndarray, ...]:
-    """Unpack coefficients of 16 bits with one unit (A,) a feature, part by part (n_p, F_p, 3, 3)."""
+    """Unpack the coefficients of `pack_coefficients`, part by part (n_p, F_p, 3, 3)."""
     out, start = [], 0
     for p, faces in enumerate(faces_of_part(features.skeleton)):
         unit = scales[features.of_part(p)]

@@ -22,7 +22,7 @@ from makehuman import MakeHuman
 from scipy.sparse import csr_array
 from scipy.spatial import cKDTree
 
-from model.built_in import KIND, STORED, VERSION, shape_space
+from model.built_in import KIND, STORED, VERSION, pack_coefficients, shape_space
 from model.human_poses import mix_moments, with_human_poses
 from model.importing import FINGERS
 from model.learning.config import LearnConfig
@@ -129,12 +129,7 @@ def joint_regressor(vertices: np.ndarray, shapes: np.ndarray, joints: np.ndarray
 
 def stored_arrays(model: ScapeModel) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
     """Arrays and header of the file: what does not follow from the population."""
-    # 16 bits a coefficient, with one unit a feature
-    space = model.pose_space
-    scales = np.concatenate([np.abs(a).max(axis=(1, 2, 3)) for a in space.coefficients]) / (2**15 - 1)
-    scales = np.maximum(scales, np.finfo(np.float32).tiny)
-    numbers = [a / scales[space.features.of_part(p)][:, None, None, None] for p, a in enumerate(space.coefficients)]
-    packed = np.concatenate([np.round(a).astype(np.int16).ravel() for a in numbers])
+    packed, scales = pack_coefficients(model.pose_space)
     features, info = model.features, dict(model.info)
     kept = np.array(info.pop("people_vertices"), dtype=np.uint16)
     return {"people_vertices": kept, "faces": model.template.faces.astype(np.uint16),
