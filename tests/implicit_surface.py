@@ -9,52 +9,12 @@ from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
-from scipy.interpolate import CubicSpline, PchipInterpolator
 
 
 class Field(Protocol):
     """Anything that gives an approximate signed distance."""
 
     def __call__(self, points: np.ndarray) -> np.ndarray: ...
-
-
-class Loft:
-    """Superelliptic cross-sections along an axis, closed by rounded caps that reach `caps` beyond the ends, metres.
-
-    Rows of `frame` are the sideways direction, the front direction and the axis. `keys` (k, 8): position on the axis,
-    centre sideways and frontwards, extents to +side, -side, front and back, metres, and the superellipse's exponent.
-    """
-
-    _TABLE = 400
-
-    def __init__(self, origin: np.ndarray, frame: np.ndarray, keys: np.ndarray, caps: tuple[float, float]) -> None:
-        self.origin, self.frame, self.caps = origin, frame, caps
-        self.start, self.end = keys[0, 0], keys[-1, 0]
-        at = np.linspace(self.start, self.end, self._TABLE)
-        smooth = CubicSpline(keys[:, 0], keys[:, 1:], bc_type="natural")(at)
-        monotone = PchipInterpolator(keys[:, 0], keys[:, 1:])(at)
-        self._table = 0.5 * (smooth + monotone)
-
-    def local(self, points: np.ndarray) -> np.ndarray:
-        """Side, front and axis coordinates (n, 3) of points."""
-        return (points - self.origin) @ self.frame.T
-
-    def __call__(self, points: np.ndarray) -> np.ndarray:
-        side, front, t = self.local(points).T
-        inside = np.clip(t, self.start, self.end)
-        place = (inside - self.start) * ((self._TABLE - 1) / (self.end - self.start))
-        low = np.minimum(place.astype(np.int64), self._TABLE - 2)
-        part = (place - low)[:, None]
-        row = self._table[low] * (1 - part) + self._table[low + 1] * part
-        u, v = side - row[:, 0], front - row[:, 1]
-        a = np.where(u > 0, row[:, 2], row[:, 3])
-        b = np.where(v > 0, row[:, 4], row[:, 5])
-        n = row[:, 6]
-        q = (np.abs(u / a)**n + np.abs(v / b)**n + 1e-12)**(1 / n)
-        over = np.where(t < self.start, (t - self.start) / self.caps[0], (t - inside) / self.caps[1])
-        q = np.sqrt(q * q + over * over)
-        rho = np.sqrt(u * u + v * v + (t - inside)**2 + 1e-12)
-        return np.where(q > 0.2, rho * (1 - 1 / np.maximum(q, 0.2)), rho - np.minimum(a, b))
 
 
 class RoundCone:

@@ -113,11 +113,6 @@ def test_colours_are_kept():
     assert np.abs(small.colors - np.clip(small.vertices + 0.5, 0, 1)).max() < mesh.mean_edge
 
 
-def test_no_more_triangles_than_there_are():
-    mesh = bumpy(3)
-    assert decimate(mesh, 10**6) is mesh
-
-
 def test_arguments_are_checked():
     mesh = bumpy(3)
     with pytest.raises(ValueError, match="faces: expected at least 4"):

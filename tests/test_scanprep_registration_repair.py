@@ -8,13 +8,12 @@ from animal_bodies import Animal
 from scanprep.geometry import rotations
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.surface import Surface
-from scanprep.registration.deformation_graph import build_graph, motion_of
 from scanprep.registration.graph_fit import start_fit
 from scanprep.registration.limbs import angle_excess, find_exchanged_sides, frames, limb_doubts, part_angles
 from scanprep.registration.matches import prepare_problem
 from scanprep.registration.nonrigid import measure_fit
 from scanprep.registration.person import PersonParts, average_person, has_limbs, is_no_person, person_parts
-from scanprep.registration.repair import better, repair_limbs, roll_parts
+from scanprep.registration.repair import better, repair_limbs
 from scanprep.registration.rolls import CHANGE, LIMBS, STEPS, best_rolls, other_rolls
 from scanprep.registration.schedule import GraphStage, RegistrationConfig
 from scanprep.skeleton.tree import Skeleton
@@ -88,26 +87,6 @@ def test_a_rolled_limb_is_asked_to_roll_back(person, parts, part, angle):
     assert np.cos(first[part] + np.radians(angle)) > 0.2             # joints leave some play
     back = np.stack([R[p] @ rotations.exp(first[p] * frames()[p, 0]) for p in range(len(PARTS))])
     assert angle_excess(part_angles(R)).max() > 40 and angle_excess(part_angles(back)).max() < 5   # degrees
-
-
-def test_a_limb_rolls_about_its_bone_and_nothing_else_moves(person, parts):
-    graph = build_graph(person.mesh, 300)
-    body = person.in_pose(find_pose("run"))
-    start, angles = motion_of(graph, body), np.zeros(len(PARTS))
-    np.testing.assert_allclose(roll_parts(graph, start, person.mesh, parts, body, angles).positions, start.positions,
-                               atol=1e-12)
-    angles[FOREARM] = 1.2
-    after = roll_parts(graph, start, person.mesh, parts, body, angles)
-    part = person.part_of_vertex[graph.node_vertices]
-    near = np.isin(part, [FOREARM, PARENTS[FOREARM], *np.flatnonzero(np.array(PARENTS) == FOREARM)])
-    np.testing.assert_allclose(after.positions[~near], start.positions[~near], atol=1e-12)
-    turn = after.R @ start.R.transpose(0, 2, 1)
-    bone = (person.skeleton.fit_rotations(person.mesh, body) @ frames()[:, 0, :, None])[FOREARM, :, 0]
-    rolls = rotations.log(turn)
-    np.testing.assert_allclose(rolls - (rolls @ bone)[:, None] * bone, 0, atol=1e-9)
-    assert 0.7 < (rolls @ bone)[part == FOREARM].mean() < 1.2        # it sets in at the joints
-    along = (after.positions - start.positions) @ bone
-    assert np.abs(along).max() < 1e-9 < np.linalg.norm(after.positions - start.positions, axis=1)[part == FOREARM].min()
 
 
 @pytest.mark.slow

@@ -7,7 +7,6 @@ import pytest
 from scanned_shapes import ball
 
 from scanprep.geometry.mesh import Mesh
-from scanprep.geometry.places import point_areas
 from scanprep.geometry.surface import Surface
 from scanprep.judgement import size
 from scanprep.registration.matches import Fit
@@ -86,19 +85,6 @@ def test_a_body_on_the_scan_keeps_its_fingers(person):
     assert Surface(fit.mesh).closest(tips).distances.max() < 0.010
     # a body beside the scan is brought there by the graph first
     assert not covers(person, scan + [0, 0.05, 0], size(person))
-
-
-def test_shares_of_a_surface_do_not_depend_on_how_densely_it_was_sampled(person):
-    low = person.vertices[:, 2] < np.median(person.vertices[:, 2])
-    cloud = person.sample(20_000, np.random.default_rng(1))[0]
-    below = cloud[:, 2] < np.median(person.vertices[:, 2])
-    dense = np.concatenate([cloud, person.sample(20_000, np.random.default_rng(2))[0]])
-    dense = dense[np.r_[np.ones(20_000, bool), dense[20_000:, 2] < np.median(person.vertices[:, 2])]]
-    areas, denser = point_areas(cloud), point_areas(dense)
-    share = person.share_of_area(low)
-    assert below @ areas / areas.sum() == pytest.approx(share, abs=0.02)
-    there = dense[:, 2] < np.median(person.vertices[:, 2])
-    assert there.mean() > share + 0.1 and there @ denser / denser.sum() == pytest.approx(share, abs=0.03)
 
 
 def test_a_piece_takes_what_it_encloses_and_the_largest_comes_first(person):

@@ -130,21 +130,6 @@ def test_holes_that_touch_in_a_vertex():
     assert filled.volume == pytest.approx(whole.volume, rel=1e-3)
 
 
-def test_sheets_that_touch_in_a_vertex_are_closed_apart():
-    a, b = ball(2), ball(2)
-    top, bottom = a.vertices[:, 2].argmax(), b.vertices[:, 2].argmin()
-    shift = a.vertices[top] - b.vertices[bottom]
-    faces = np.concatenate([a.faces, b.faces + len(a.vertices)])
-    faces[faces == bottom + len(a.vertices)] = top
-    pair = Mesh(np.concatenate([a.vertices, b.vertices + shift]), faces)
-    pair = pair.submesh(np.setdiff1d(np.arange(len(faces)),
-                                     [np.flatnonzero((faces[:len(a.faces)] == top).any(axis=1))[0],
-                                      len(a.faces) + np.flatnonzero((faces[len(a.faces):] == top).any(axis=1))[0]]))[0]
-    filled = fill_holes(pair)
-    assert filled.is_closed and filled.is_vertex_manifold
-    assert filled.volume == pytest.approx(2 * a.volume, rel=1e-6)
-
-
 def test_a_border_of_hundreds_of_edges():
     whole = ball(6, 0.5)
     holed = pierced(whole, [0.5, 0, 0], 0.35)

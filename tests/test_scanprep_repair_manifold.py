@@ -3,13 +3,12 @@ import pytest
 from scanned_shapes import ball, bumpy
 
 from scanprep.geometry.mesh import Mesh, template_problem
-from scanprep.geometry.remeshing import flip_edges, smooth_taubin
+from scanprep.geometry.remeshing import smooth_taubin
 from scanprep.geometry.surface import Surface
 from scanprep.repair.manifold import (
     drop_small_components,
     orient_triangles,
     repair,
-    split_vertices,
     weld,
 )
 
@@ -64,18 +63,6 @@ def test_repair_twice_is_repair_once():
     assert template_problem(once) is None
     twice = repair(once)
     assert np.array_equal(once.corners, twice.corners) and len(once.vertices) == len(twice.vertices)
-
-
-def test_two_fans_at_a_vertex_are_parted():
-    a, b = ball(1), ball(1)
-    faces = np.concatenate([a.faces, b.faces + len(a.vertices)])
-    faces[faces == len(a.vertices)] = 0
-    pair = Mesh(np.concatenate([a.vertices, b.vertices + a.vertices[0] - b.vertices[0]]), faces)
-    assert not pair.is_vertex_manifold
-    parted = split_vertices(pair)
-    assert parted.is_vertex_manifold
-    assert np.array_equal(parted.corners, pair.corners)
-    assert len(np.unique(parted.faces)) == len(np.unique(pair.faces)) + 1
 
 
 @pytest.mark.parametrize("share", [0.05, 0.4])
@@ -136,28 +123,6 @@ def test_pieces_are_dropped_by_size():
     for share, kept in ((0.0, sizes), (0.1, sizes[:2]), (1.0, sizes[:1])):
         assert len(drop_small_components(mesh, share).vertices) == sum(kept)
     assert len(repair(mesh, min_component=0.1).vertices) == sum(sizes[:2])
-
-
-def test_turned_edges_of_a_plane_are_delaunay():
-    rng = np.random.default_rng(1)
-    inner = rng.random((60, 2))
-    corners = np.array([[-1, -1], [2, -1], [2, 2], [-1, 2]])
-    points = np.concatenate([corners, inner])
-    faces = [(0, 1, 2), (0, 2, 3)]
-    for p in range(4, len(points)):               # split the triangle that holds each point: slivers abound
-        for k, (a, b, c) in enumerate(faces):
-            s = [np.linalg.det([points[v] - points[u], points[p] - points[u]]) for u, v in ((a, b), (b, c), (c, a))]
-            if min(s) > 0:
-                faces[k:k + 1] = [(a, b, p), (b, c, p), (c, a, p)]
-                break
-    mesh = Mesh(np.c_[points, np.zeros(len(points))], faces)
-    turned = flip_edges(mesh, rounds=200)
-    assert turned.face_areas.sum() == pytest.approx(mesh.face_areas.sum())
-    assert turned.face_normals[:, 2].min() > 0.999
-    for a, b, c in points[turned.faces]:          # no point inside any circumscribed circle
-        centre = np.linalg.solve(2 * np.array([b - a, c - a]), [b @ b - a @ a, c @ c - a @ a])
-        radius = np.linalg.norm(a - centre)
-        assert np.linalg.norm(points - centre, axis=1).min() > radius * (1 - 1e-2)
 
 
 def test_smoothing_takes_noise_off_and_keeps_the_size():

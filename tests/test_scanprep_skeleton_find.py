@@ -170,19 +170,6 @@ def test_moving_the_bodies_and_the_template_changes_nothing_but_the_place(
     assert np.allclose(skeleton.joints[1:], found.joints[1:] @ R0.T + t0, atol=1e-4)
 
 
-@pytest.mark.slow
-def test_the_order_of_vertices_and_faces_does_not_matter(
-        figure: Figure, poses: np.ndarray, found: Skeleton) -> None:
-    rng = np.random.default_rng(8)
-    mesh = figure.template
-    old, old_face = rng.permutation(len(mesh.vertices)), rng.permutation(len(mesh.faces))
-    new = np.argsort(old)
-    shuffled = Figure(Mesh(mesh.vertices[old], new[mesh.faces[old_face]]), figure.part_of_vertex[old])
-    skeleton = find_skeleton(shuffled.template, poses[:, old], FEW)
-    part, before = match(shuffled, skeleton), match(figure, found)
-    assert np.allclose(skeleton.joints[part[1:]], found.joints[before[1:]], atol=1e-4)
-
-
 def test_the_same_input_gives_the_same_bytes(figure: Figure, poses: np.ndarray, found: Skeleton) -> None:
     again = find_skeleton(figure.template, poses, FEW)
     assert again.joints.tobytes() == found.joints.tobytes()

@@ -48,14 +48,6 @@ def test_in_the_mirror_left_is_right(person):
         assert name == (f"{stem}_{swapped[side]}" if side in swapped else true)
 
 
-def test_the_order_of_vertices_and_parts_does_not_matter(person):
-    rng = np.random.default_rng(0)
-    old, faces = rng.permutation(len(person.mesh.vertices)), rng.permutation(len(person.mesh.faces))
-    mesh = Mesh(person.mesh.vertices[old], np.argsort(old)[person.mesh.faces[faces]])
-    found = named(mesh, Skeleton(person.part_of_face[faces], person.parents, person.joints))
-    assert found == person.names
-
-
 def test_the_limbs_of_a_pair_are_on_two_sides_of_a_body_that_leans(person):
     """Both legs were to the left of the middle of the hips, both became left, and learning ended there."""
     leaning, joints = (points + np.outer(np.maximum(0, 1 - points[:, 2]), [0.6, 0, 0])

@@ -13,7 +13,7 @@ from scanprep.skeleton.labels import label_patches
 from scanprep.skeleton.motions import PosedSurface, fit_motions, rigid_costs
 from scanprep.skeleton.names import part_partners
 from scanprep.skeleton.parts import PartSearch, SkeletonConfig
-from scanprep.skeleton.sides import Sides, cover, mirror_pairs
+from scanprep.skeleton.sides import Sides
 from scanprep.skeleton.symmetry import Symmetry, find_symmetry, mirror_poses
 from scanprep.synthetic.anatomy import MIRROR_PART
 from scanprep.synthetic.people import SyntheticPerson, mirror_synthetic_pose
@@ -103,19 +103,6 @@ def test_a_lump_is_not_symmetric():
     x = animal.mesh.vertices @ ODD
     lump = x * (1 + 0.5 * np.sin(x @ [[4.0, 1], [2, 5], [3, -2]]).sum(axis=1, keepdims=True)) + 0.4 * x[:, [1, 2, 0]]
     assert not find_symmetry(Mesh(lump, animal.mesh.faces)).holds
-
-
-def test_tied_labels_are_mirror_images(animal, poses):
-    surface, symmetry = PosedSurface(animal.mesh, poses), find_symmetry(animal.mesh)
-    sides = Sides(surface, symmetry)
-    patch = cover(surface, 60, sides, np.random.default_rng(1))
-    partner = sides.partners(patch)
-    assert (partner[partner] == np.arange(len(partner))).all() and (partner != np.arange(len(partner))).all()
-    assert (patch[sides.mirrored] == partner[patch[symmetry.partner[sides.mirrored]]]).all()
-    joined = sides.join(patch, 0, int(partner[0]), partner)
-    assert len(np.unique(joined)) == len(partner) - 1
-    pairs = np.array([[0, 1], *np.sort(partner[[[0, 1]]])])
-    assert mirror_pairs(pairs, partner).tolist() == [1, 0]
 
 
 def mirrored_sheet(n):

@@ -15,7 +15,7 @@ from scanprep.geometry.landmark_names import TEN
 from scanprep.geometry.landmarks import read_landmark_vertices
 from scanprep.geometry.mesh import template_problem
 from scanprep.geometry.surface import Surface
-from scanprep.surfaces.cloud import mesh_of_cloud, mesh_of_view, spacing_of
+from scanprep.surfaces.cloud import mesh_of_cloud, mesh_of_view
 from scanprep.surfaces.template import carry_landmarks, share_on_left, template_of_scan, views_without_cameras
 from scanprep.synthetic.landmarks import landmarks
 from scanprep.synthetic.people import SyntheticPerson
@@ -157,12 +157,6 @@ def test_views_without_cameras_find_their_places(body):
     after = Surface(body).closest(cloud.points)
     assert np.median(before) > 0.007 and np.median(after.distances) < 0.004
     assert (np.einsum("nd,nd->n", cloud.normals, body.face_normals[after.faces]) > 0).mean() > 0.97
-
-
-def test_the_spacing_of_points_is_that_of_the_surface(body):
-    points = body.sample(20000, np.random.default_rng(0))[0]
-    wanted = np.sqrt(body.face_areas.sum() / 20000)
-    assert spacing_of(points) == pytest.approx(wanted, rel=0.1)
 
 
 def test_what_cannot_be_meshed_says_why(tmp_path, capsys, monkeypatch):

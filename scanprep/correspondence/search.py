@@ -34,6 +34,11 @@ class CorrelatedConfig(Settings):
         Points of the scan for which an image is sought.
     spacing : float
         Distance to which the scan is thinned, as a multiple of the template's size, √area.
+
+    Examples
+    --------
+    >>> CorrelatedConfig(points=100).spacing
+    0.009
     """
 
     points: Count = 240
