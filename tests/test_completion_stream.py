@@ -331,3 +331,14 @@ def test_one_frame_that_no_body_makes_is_passed_over(passing, unbroken, wrong):
     for there, other in zip(frames[1:], clean[1:], strict=True):
         assert other.converged and there.converged
         np.testing.assert_array_equal(there.trusted, other.trusted)
+
+
+def test_feet_that_slide_are_free_and_sunk_ones_are_lifted(walker):
+    subject, layout, motions = walker
+    body = MarkedBody(subject, layout, 0.3, 0.3)
+    x = body.body.join(*motions["stand"])
+    x[:, -3] += np.arange(60) / 60                                   # one metre a second, upright
+    feet = FootContact(body, x, 60.0)
+    assert np.isnan(feet.stands).all()
+    x[:, -1] -= 0.1
+    assert np.nanmin(feet.floor.above(feet.target_positions(x))) > -1e-9
