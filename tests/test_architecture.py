@@ -27,7 +27,7 @@ ROOMS = {
         "geometry": "", "adapters": "geometry", "batch": "geometry", "cleaning": "geometry",
         "correspondence": "geometry", "depth_camera": "geometry", "pictures": "geometry",
         "repair": "geometry", "skeleton": "batch geometry",
-        "decimation": "geometry skeleton", "fusion": "geometry repair", "synthetic": "geometry skeleton",
+        "decimation": "adapters geometry skeleton", "fusion": "geometry repair", "synthetic": "geometry skeleton",
         "alignment": "fusion geometry",
         "registration": "alignment cleaning correspondence geometry skeleton synthetic",
         "surfaces": "adapters alignment cleaning decimation fusion geometry registration repair skeleton",

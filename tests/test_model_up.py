@@ -93,8 +93,7 @@ def test_the_model_keeps_up_and_all_files_follow(folder, tmp_path):
 
 
 def test_up_can_be_said(folder, tmp_path):
-    learn(folder, tmp_path / "m.npz").with_up("y").save(tmp_path / "y.npz")
-    assert load_model(tmp_path / "y.npz").template.up == 1
+    assert learn(folder, tmp_path / "y.npz", "--up", "y").template.up == 1
     assert main(["model", "export", str(tmp_path / "y.npz"), "-o", str(tmp_path / "a.glb"), "--own-body", "--up", "z"]
                 ) == 0
     assert Glb((tmp_path / "a.glb").read_bytes()).json["asset"]["extras"]["up"] == "z"

@@ -1,9 +1,12 @@
 
+import sys
+
 import numpy as np
 import pytest
 from scanned_shapes import SIX, bumpy, triangle_quality, view
 from scipy.spatial import cKDTree
 
+from scanprep.adapters.open3d_filters import MissingLibraryError
 from scanprep.decimation.decimate import DecimateConfig, decimate
 from scanprep.decimation.quadrics import minimise_quadrics, plane_quadrics, point_quadrics, surface_quadrics, value
 from scanprep.geometry.mesh import Mesh, template_problem
@@ -142,3 +145,20 @@ def test_views_become_a_template():
     assert at.distances.mean() < 0.001
     assert (np.einsum("nd,nd->n", template.vertex_normals, shape.face_normals[at.faces]) > 0).all()
     assert np.percentile(triangle_quality(template), 1) > 0.7
+
+
+def test_meshlab_as_a_method():
+    try:
+        __import__("pymeshlab")
+    except (ImportError, OSError) as error:
+        pytest.skip(f"pymeshlab cannot be imported: {error}")
+    mesh = bumpy(5)
+    small = decimate(mesh, 3000, DecimateConfig("pymeshlab"))
+    assert small.is_closed and len(small.faces) == pytest.approx(3000, abs=4)
+    assert Surface(small).closest(mesh.vertices).distances.mean() < 0.03 * small.mean_edge
+
+
+def test_a_missing_library_is_named(monkeypatch):
+    monkeypatch.setitem(sys.modules, "pymeshlab", None)
+    with pytest.raises(MissingLibraryError, match=r"pymeshlab cannot be imported.*libegl1 libgl1 libx11-6"):
+        decimate(bumpy(3), 100, DecimateConfig("pymeshlab"))

@@ -365,3 +365,30 @@ def test_seams_and_lost_points_together_keep_the_numbers_of_the_file(tmp_path):
     mesh = quiet(read_mesh, tmp_path / "a.obj")
     assert mesh.of_file.tolist() == [0, 1, 2, 3, -1, 0, 1, 2, 3]
     same(mesh, TETRAHEDRON, 0)
+
+
+def test_a_range_grid_is_joined_where_neighbours_are_near(tmp_path):
+    rows, columns = 6, 8
+    y, x = np.mgrid[:rows, :columns] * 0.01
+    z = np.where(x > 0.035, 0.5, 0.0)                            # a step half a metre deep between columns 3 and 4
+    seen = np.ones((rows, columns), bool)
+    seen[0, 0] = False
+    points = np.stack([x, y, z], axis=2)[seen]
+    number = iter(range(len(points)))
+    cells = "\n".join(f"1 {next(number)}" if there else "0" for there in seen.ravel())
+    header = PLY.format("ascii\nobj_info num_cols 8\nobj_info num_rows 6\ncomment", XYZ, "range_grid", 48, "uchar")
+    header = header.replace("comment 1.0", "").replace("ascii", "ascii 1.0").replace("vertex 4", "vertex 47")
+    rows_of_points = "\n".join(" ".join(f"{v:.9g}" for v in p) for p in points)
+    (tmp_path / "a.ply").write_text(header.replace("\n\n", "\n") + rows_of_points + "\n" + cells + "\n")
+    with pytest.warns(UserWarning, match="range grid of 6 x 8.* 59 triangles, 10 that span jumps"):
+        mesh = read_mesh(tmp_path / "a.ply")
+    assert mesh.vertices.shape == (47, 3)
+    np.testing.assert_allclose(mesh.face_normals, np.tile([0.0, 0, 1], (59, 1)), atol=1e-9)       # towards the scanner
+
+
+def test_points_that_are_not_finite_are_left_out(tmp_path):
+    text = PLY.format("ascii", XYZ, "face", 1, "uchar") + "0 0 0\nnan nan nan\n1 0 0\n0 1 0\n3 0 2 3\n"
+    (tmp_path / "a.ply").write_text(text)
+    with pytest.warns(UserWarning, match="1 of 4 points are not finite and were left out$"):
+        mesh = read_mesh(tmp_path / "a.ply")
+    assert mesh.faces.tolist() == [[0, 1, 2]] and mesh.of_file.tolist() == [0, -1, 1, 2]

@@ -113,7 +113,7 @@ def written(flag, value, hint):
 
 
 def test_every_command_is_here():
-    assert len(CALLS) >= 33 and len(SETTINGS) >= 40
+    assert len(CALLS) >= 33 and len(SETTINGS) >= 25
     assert len(list(usages())) > 60
 
 
@@ -145,12 +145,8 @@ def flags(function):
 
 
 def test_commands_have_few_flags():
-    """Eight of all are --up, of commands that turn a scan or a model; one is --static of mosh.
-
-    Seven are of figures: --own-mesh and --names of two commands, --cut, and --joints and --start of `pick`.
-    """
     counted = {prog: flags(function) for prog, function in CALLS.items()}
-    assert {prog: n for prog, n in counted.items() if n > 16} == {} and sum(counted.values()) <= 315, counted
+    assert {prog: n for prog, n in counted.items() if n > 15} == {} and sum(counted.values()) <= 304, counted
 
 
 @pytest.mark.parametrize("prog", CALLS)

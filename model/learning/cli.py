@@ -1,6 +1,7 @@
 """`scape learn`: a body model from registered meshes."""
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from shlex import quote
 from typing import Annotated
@@ -23,7 +24,7 @@ from scanprep.skeleton.names import note_numbered_parts
 from scanprep.skeleton.roles import joint_in_words
 from scanprep.skeleton.tree import Skeleton
 
-from ..body import BodyModel
+from ..body import BodyModel, Up
 from ..cli import about, read_bodies
 from ..fitting.search import ModelMismatchError
 from .body import Kind, learn_body
@@ -37,8 +38,9 @@ WITH_PRIOR = "scape", "blendscape"
 
 def learn(poses: Path, output: Output, shapes: Path | None = None, skeleton: Path | None = None,
           landmarks: Path | None = None, subject: Annotated[str | None, Person] = None, unit: Unit | None = None,
-          kind: Kind = "scape", by_sex: bool = False, prior: str = "auto", scape: LearnConfig = LearnConfig(),
-          skinning: SkinConfig = SkinConfig(), mixed: LearnConfig = MIX, *, space: FileWorkspace) -> Outcome:
+          up: Up | None = None, kind: Kind = "scape", by_sex: bool = False, prior: str = "auto",
+          scape: LearnConfig = LearnConfig(), skinning: SkinConfig = SkinConfig(), mixed: LearnConfig = MIX, *,
+          space: FileWorkspace) -> Outcome:
     """Learn a body model from one person in many poses and many people in about one pose, or from a mix.
 
     From few scans it is a known model, adapted: what they do not show, how joints bend and how people differ, is as
@@ -59,6 +61,8 @@ def learn(poses: Path, output: Output, shapes: Path | None = None, skeleton: Pat
         landmarks: Landmarks of the template, kept in the model for `scape complete`; else the set's own.
         subject: Of a registered set, whose meshes are the poses; else of the one with the most.
         unit: Unit of the meshes.
+        up: Axis of the meshes that points up, kept in the model; else as the files say (GLB: y), else that along which
+            the poses stand on their feet, else that of the largest extent.
         kind: SCAPE, BlendSCAPE, linear blend skinning with pose-corrective shapes, or SCAPE from a mix: the poses are
             then those of many people, a registered set that says whose mesh each is.
         prior: Where scans say little, as in this model: a file, "people", "none", or "auto", the built-in people for a
@@ -85,6 +89,7 @@ def learn(poses: Path, output: Output, shapes: Path | None = None, skeleton: Pat
     # bodies to learn from, and the landmarks that the model keeps
     (body, posed, names), who = (_read_mix(poses) if kind == "mixed" else
                                  (read_poses(poses, None, subject, unit), []))
+    body = body if up is None else replace(body, up="xyz".index(up))
     people = None
     doubts = find_doubtful_members(body, posed, str(poses), names, np.inf if kind == "mixed" else ONE_BODY)
     if shapes is not None:

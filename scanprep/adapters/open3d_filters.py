@@ -45,7 +45,7 @@ def ball_pivoting(points: np.ndarray, normals: np.ndarray, spacing: float) -> Me
 
 
 def library(name: str) -> Any:
-    """Import open3d; MissingLibrary with advice if that fails."""
+    """Import open3d or pymeshlab; MissingLibrary with advice if that fails."""
     try:
         return importlib.import_module(name)
     except (ImportError, OSError) as error:

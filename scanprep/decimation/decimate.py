@@ -15,7 +15,7 @@ from ..ranges import FLAG, Settings
 from .edge_collapse import FIXED, Rounds
 from .quadrics import sum_at
 
-Method = Literal["quadric", "even"]
+Method = Literal["quadric", "even", "pymeshlab"]
 
 
 @dataclass(frozen=True)
@@ -26,7 +26,8 @@ class DecimateConfig(Settings):
     ----------
     method : str
         "quadric": least-error collapses, small triangles where the surface bends [QEM]. "even": shortest edges
-        first, triangles of equal size. Both keep a closed manifold mesh closed and manifold.
+        first, triangles of equal size. Both keep a closed manifold mesh closed and manifold. "pymeshlab": least-error
+        collapses of MeshLab, which is under the GPL.
     improve : bool
         Flip edges and move vertices along the original surface, for well-shaped triangles.
 
@@ -91,7 +92,7 @@ def decimate(mesh: Mesh, faces: int, config: DecimateConfig | None = None, keep:
     else:
         if keep is not None:
             raise ValueError(f"keep: the method {config.method!r} cannot keep them; expected 'quadric'")
-        smaller = _evenly(mesh, faces)
+        smaller = _evenly(mesh, faces) if config.method == "even" else _by_meshlab(mesh, faces)
     # methods that drop colours take those of the nearest vertex
     if smaller.colors is None and mesh.colors is not None:
         nearest = cKDTree(mesh.vertices).query(smaller.vertices)[1]
@@ -137,3 +138,10 @@ def _evenly(mesh: Mesh, faces: int) -> Mesh:
     inner = np.setdiff1d(np.arange(len(placed)), smaller.boundary_vertices)
     placed[inner] = Surface(mesh).closest(placed[inner]).points
     return smaller.with_vertices(placed)
+
+
+def _by_meshlab(mesh: Mesh, faces: int) -> Mesh:
+    """Decimate with the method "pymeshlab"; its adapter is loaded only here."""
+    from ..adapters.pymeshlab_filters import meshlab_decimation
+
+    return meshlab_decimation(mesh, faces)

@@ -1,11 +1,12 @@
 """Read and write PLY: ascii, and binary of either byte order, with colours and normals; the rest is skipped.
 
-Triangles come from polygons or from strips (`tristrips`).
+Triangles come from polygons, from strips (`tristrips`), or from the grid of a range scanner (`range_grid`).
 """
 from __future__ import annotations
 
 import contextlib
 import re
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import islice
@@ -73,7 +74,8 @@ def read(path: Path, data: bytes) -> Contents:
         counts = ", ".join(f"{e.count} {e.name}" for e in elements)
         raise MeshFileError(f"{path}: expected the end of the file after {counts}, found {rest} more "
                             f"{'lines' if lines else 'bytes'}")
-    return _contents(path, elements[names.index("vertex")], found)
+    rows = [int(line.split()[2]) for line in data[:start].splitlines() if line.startswith(b"obj_info num_rows ")]
+    return _contents(path, elements[names.index("vertex")], found, rows[0] if rows else 0)
 
 
 def _header(path: Path, data: bytes) -> tuple[str, list[Element], int, int]:
@@ -236,7 +238,7 @@ def _ascii_rows(lines: Lines, element: Element, rows: range) -> dict[str, _Colum
     return columns
 
 
-def _contents(path: Path, vertex: Element, found: dict[str, dict[str, _Column]]) -> Contents:
+def _contents(path: Path, vertex: Element, found: dict[str, dict[str, _Column]], grid_rows: int) -> Contents:
     """Make the contents of the columns of all elements."""
     columns = found["vertex"]
 
@@ -255,12 +257,12 @@ def _contents(path: Path, vertex: Element, found: dict[str, dict[str, _Column]])
     # integer colours are multiples of 1/255 or 1/65535; floats may have any scale
     colors = next((as_colors(c, kinds[names[0]].kind in "iu") for names in _COLORS if (c := triple(names)) is not None),
                   None)
-    return Contents(vertices, _faces(path, found, vertices), triple(("nx", "ny", "nz")), colors)
+    return Contents(vertices, _faces(path, found, vertices, grid_rows), triple(("nx", "ny", "nz")), colors)
 
 
-def _faces(path: Path, found: dict[str, dict[str, _Column]], vertices: np.ndarray) -> np.ndarray | None:
-    """Return triangles (F, 3) of the first non-empty element of faces or strips; None for a cloud."""
-    for name in ("face", "tristrips"):
+def _faces(path: Path, found: dict[str, dict[str, _Column]], vertices: np.ndarray, grid_rows: int) -> np.ndarray | None:
+    """Return triangles (F, 3) of the first non-empty element of faces, strips or grid; None for a cloud."""
+    for name in ("face", "tristrips", "range_grid"):
         lists = found.get(name, {}).get("vertex_indices", found.get(name, {}).get("vertex_index"))
         if name not in found or (isinstance(lists, tuple) and not len(lists[0])):
             continue
@@ -272,7 +274,7 @@ def _faces(path: Path, found: dict[str, dict[str, _Column]], vertices: np.ndarra
         sizes, corners = lists
         if name == "face":
             return polygons(path, sizes, corners, len(vertices), vertices=vertices)
-        faces = _strips(sizes, corners)
+        faces = _strips(sizes, corners) if name == "tristrips" else _grid(path, sizes, corners, grid_rows, vertices)
         return polygons(path, np.full(len(faces), 3), faces.ravel(), len(vertices))
     return None
 
@@ -282,6 +284,37 @@ def _strips(sizes: np.ndarray, corners: np.ndarray) -> np.ndarray:
     strip = np.repeat(np.arange(len(sizes)), sizes) + np.cumsum(corners < 0)
     listed = corners >= 0
     return strip_triangles(corners[listed].astype(np.int64), np.unique(strip[listed], return_counts=True)[1])
+
+
+def _grid(path: Path, sizes: np.ndarray, corners: np.ndarray, rows: int, vertices: np.ndarray) -> np.ndarray:
+    """Triangulate the grid of a range scanner (F, 3), whose cells hold one vertex or none."""
+    if rows <= 0 or len(sizes) % rows or not np.isin(sizes, (0, 1)).all():
+        raise MeshFileError(f"{path}: expected a range_grid of one vertex or none a cell, and obj_info num_rows and "
+                            f"num_cols that agree with its {len(sizes)} cells; found {rows} rows")
+    if len(corners) and not 0 <= corners.min() <= corners.max() < len(vertices):
+        raise MeshFileError(f"{path}: the range_grid refers to vertices {corners.min()}..{corners.max()}, "
+                            f"expected 0..{len(vertices) - 1}")
+    numbers = np.full(len(sizes), -1)
+    numbers[sizes == 1] = corners
+    cells: np.ndarray = numbers.reshape(rows, -1)
+    a, b, c, d = (part.ravel() for part in (cells[:-1, :-1], cells[:-1, 1:], cells[1:, 1:], cells[1:, :-1]))
+    # two triangles per square, along its shorter diagonal; one if a corner is missing
+    shorter = np.linalg.norm(vertices[a] - vertices[c], axis=1) <= np.linalg.norm(vertices[b] - vertices[d], axis=1)
+    along_ac = (shorter & (a >= 0) & (c >= 0)) | (b < 0) | (d < 0)
+    faces = np.where(along_ac[:, None, None], np.stack([[a, d, c], [a, c, b]]).transpose(2, 0, 1),
+                     np.stack([[a, d, b], [b, d, c]]).transpose(2, 0, 1)).reshape(-1, 3)
+    faces = faces[(faces >= 0).all(axis=1)]
+    longest = np.linalg.norm(vertices[faces] - vertices[np.roll(faces, 1, axis=1)], axis=2).max(axis=1, initial=0)
+    # orient towards +z: range scanners look along -z, whatever the direction of their rows
+    a, b, c = vertices[faces].transpose(1, 0, 2)
+    if np.cross(b - a, c - a)[:, 2].sum() < 0:
+        faces = faces[:, ::-1]
+    # edges longer than four medians span a jump between surfaces: triangles seen at 75 degrees have edges four times as
+    # long as those seen from the front
+    kept = longest <= 4.0 * np.median(longest) if len(longest) else np.zeros(0, bool)
+    warnings.warn(f"{path}: a range grid of {rows} x {cells.shape[1]}: neighbours were joined by {kept.sum()} "
+                  f"triangles, {len(kept) - kept.sum()} that span jumps were left out", stacklevel=2)
+    return np.asarray(faces[kept])
 
 
 def encode(contents: Contents, double: bool) -> bytes:

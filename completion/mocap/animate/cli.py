@@ -8,6 +8,7 @@ from typing import Annotated
 
 import numpy as np
 
+from model.body import Up
 from model.linear import Subject
 from model.posing.cli import read_subject
 from scanprep.arguments import Place, UsageError
@@ -35,7 +36,7 @@ MarkersArg = Annotated[Path, Place("MARKERS")]
 def animate_markers(markers: MarkersArg, output: Output, model: ModelOrNone = None, layout: str | None = None,
                     subject: str | None = None, unit: PersonUnit | None = None, rate: Positive | None = None,
                     retarget_to: Path | None = None, betas_to: Path | None = None, unlabelled: bool = False,
-                    ground: bool = False, config: AnimateConfig = AnimateConfig(),
+                    ground: bool = False, up: Up | None = None, config: AnimateConfig = AnimateConfig(),
                     person: PersonConfig = PersonConfig(), angles: AngleConfig = AngleConfig(),
                     workers: Workers = Workers(), *, space: Workspace) -> Outcome:
     """The motion of a person from markers, and the person; or a motion of another skeleton on a body.
@@ -75,6 +76,7 @@ def animate_markers(markers: MarkersArg, output: Output, model: ModelOrNone = No
         unlabelled: The markers have no names: they are labelled first, as by `scape label`; --layout says which are
             worn.
         ground: Foot contact: feet do not sink into the floor and do not slide while they stand on it.
+        up: Axis of the model that points up, which GLB and BVH turn to y; else as the model says.
         config: Settings.
         person: Settings of the person from markers.
         angles: Settings of the joint angles.
@@ -95,6 +97,7 @@ def animate_markers(markers: MarkersArg, output: Output, model: ModelOrNone = No
     config = replace(config, ground=ground or config.ground)
     units = resolve_marker_unit([markers], unit)
     loaded, name = read_model(model)
+    loaded = loaded.with_up(up)
     body = loaded if subject == "markers" else body_of(loaded, subject, unit)
     work = AnimateTask(loaded, name, None if layout is None else layout_or_file(layout),
                        body if isinstance(body, Subject) else None,
