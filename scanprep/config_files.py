@@ -12,7 +12,7 @@ import re
 import textwrap
 import types
 import typing
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -23,9 +23,7 @@ Path_ = tuple[str, ...]              # path of a field: parameter, then names of
 
 # What became of settings of earlier versions: `Class.field`, wherever the class is nested, or the whole name in a file,
 # as `table.field`, where the class is gone too. One sentence each, of what holds now.
-REMOVED: dict[str, str] = {
-    "ScanSettings.pictures": "every scan of a set has its picture on the page",
-}
+REMOVED = Path(__file__).with_name("removed_settings.json")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -179,14 +177,15 @@ class _Place:
             names = f"; did you mean {near[0]}?" if near else f"; there are: {', '.join(known)}"
             raise self.error(name, table, f"expected a {what} of this command{names}")
 
-    def check_removed(self, names: Iterable[str], table: Path_, owner: type | None = None) -> None:
+    def check_removed(self, names: Collection[str], table: Path_, owner: type | None = None) -> None:
         """Raise an error for settings of earlier versions: all of a table at once, as each is a line to delete."""
         classes = () if owner is None else owner.__mro__
+        sentences = storage.read_json(REMOVED, "sentences on settings that left") if names else {}
         problems = []
         for name in names:
             keys = [".".join((*table, name)), *(f"{base.__name__}.{name}" for base in classes)]
-            problems += [str(self.error(name, table, f"this setting is gone: {REMOVED[key]}"))
-                         for key in keys if key in REMOVED][:1]
+            problems += [str(self.error(name, table, f"this setting is gone: {sentences[key]}"))
+                         for key in keys if key in sentences][:1]
         if problems:
             raise ValueError("; ".join(problems))
 

@@ -2,6 +2,7 @@
 import dataclasses
 import functools
 import inspect
+import json
 from typing import Annotated, Literal
 
 import pytest
@@ -116,8 +117,10 @@ def test_a_flag_wins_over_the_file_and_the_file_over_the_preset(tmp_path, capsys
     ("rounds 3\n", ":1: expected TOML"),
 ])
 def test_what_is_wrong_with_a_file(tmp_path, capsys, monkeypatch, text, told):
-    monkeypatch.setattr(config_files, "REMOVED", {"Outer.colours": "all are grey", "Inner.height": "it is 3 mm",
-                                                  "inner.width": "use the height"})
+    gone = tmp_path / "removed.json"
+    gone.write_text(json.dumps({"Outer.colours": "all are grey", "Inner.height": "it is 3 mm",
+                                "inner.width": "use the height"}))
+    monkeypatch.setattr(config_files, "REMOVED", gone)
     path = tmp_path / "my.toml"
     path.write_text(text)
     config, code, said = run(["--config", path], capsys)
@@ -128,7 +131,7 @@ def test_what_is_wrong_with_a_file(tmp_path, capsys, monkeypatch, text, told):
 def test_settings_that_left_are_told_in_one_sentence_each(tmp_path, capsys):
     """They are not there any more, whether their class is or not; also in a file of a command of several groups."""
     classes = {cls.__name__: {field.name for field in dataclasses.fields(cls)} for cls in SETTINGS}
-    for key, sentence in config_files.REMOVED.items():
+    for key, sentence in json.loads(config_files.REMOVED.read_text()).items():
         owner, _, name = key.rpartition(".")
         assert name not in classes.get(owner, ()) and 1 < len(sentence.split()) <= 25 and sentence[-1] != "."
     path = config_file(tmp_path, scan={"pictures": False, "registration": {}})
@@ -176,7 +179,7 @@ def test_the_preset_of_every_command_is_in_force(prog):
     name, usual = next(iter(values.items()))
     paper = type(usual).from_paper()
     own = {f.name for f in dataclasses.fields(usual) if getattr(usual, f.name) != getattr(type(usual)(), f.name)}
-    assert found.presets and found.values[name] != usual and own <= {"displacement"}
+    assert found.presets and found.values[name] != usual and own <= {"size"}
     for field in dataclasses.fields(usual):
         source = usual if field.name in own else paper
         assert getattr(found.values[name], field.name) == getattr(source, field.name)
