@@ -14,6 +14,7 @@ from scanprep.geometry import rotations
 from scanprep.geometry.farthest_points import spread_indices
 from scanprep.geometry.mesh import Mesh
 from scanprep.pictures.camera import Camera, look_around, stance
+from scanprep.pictures.page import Page
 from scanprep.pictures.scene import Pane
 from scanprep.pictures.shading import Dots, Moving, Solid, contact_sheet, render
 
@@ -183,23 +184,26 @@ def mean_over(values: np.ndarray, axis: int) -> np.ndarray:
         return np.nanmean(values, axis=axis)
 
 
-def marker_rows(labels: Sequence[str], residuals: np.ndarray, soft: np.ndarray | None, trusted: np.ndarray | None
-                ) -> list[tuple[Any, ...]]:
-    """Make a table of markers, the worst first: label, mean distances (mm), 95th percentile, seen and trusted (%).
+def show_markers(page: Page, motion: Motion, soft: Motion | None = None) -> None:
+    """Add a table of the markers, the worst first, and the names of those that were never used.
 
-    Distances (T, L) are from the body of fixed shape, and if given from the `soft` one, to which the percentile refers.
-    Markers that were never seen are left out, unless `trusted` is None.
+    Distances are from the body of fixed shape, and if given from the one with `soft` tissue, to which the 95th
+    percentile refers.
     """
-    out = []
-    for i, label in enumerate(labels):
-        seen = np.isfinite(residuals[:, i])
-        if seen.any() or trusted is None:
-            shown = 1000 * (residuals if soft is None else soft)[seen, i]
-            out.append((label, 1000 * float(mean_over(residuals[:, i], 0)),
-                        np.nan if soft is None else 1000 * float(mean_over(soft[:, i], 0)),
-                        float(np.nanpercentile(shown, 95)) if len(shown) else np.nan, 100 * float(seen.mean()),
-                        np.nan if trusted is None else 100 * float(trusted[seen, i].mean())))
-    return sorted(out, key=lambda row: -row[1])
+    motions = {"mean distance (mm)": motion} if soft is None else {"fixed shape (mm)": motion, "soft tissue (mm)": soft}
+    shown, rows, unused = motion if soft is None else soft, [], []
+    for i, label in enumerate(motion.labels):
+        seen = np.isfinite(motion.residuals[:, i])
+        if not seen.any():
+            unused.append(label)
+            continue
+        rows.append((label, *(1000 * float(mean_over(each.residuals[:, i], 0)) for each in motions.values()),
+                     float(np.nanpercentile(1000 * shown.residuals[seen, i], 95)), 100 * float(seen.mean()),
+                     100 * float(motion.trusted[seen, i].mean())))
+    page.table(sorted(rows, key=lambda row: -row[1]),
+               ("marker", *motions, "95th percentile (mm)", "seen (%)", "believed (%)"))
+    if unused:
+        page.text(f"Not used, because the layout does not know them or they were never seen: {', '.join(unused)}.")
 
 
 def chart(width: float, height: float) -> tuple[Any, Any]:
@@ -224,28 +228,4 @@ def chart_residuals(motion: Motion, what: str = "markers", lost: bool = False) -
         axes.axvspan(*span, color="0.85", label="lost" if i == 0 else None)
     axes.set(xlabel="time (s)", ylabel=f"distance of the {what} (mm)", ylim=(0, None))
     axes.legend(frameon=False)
-    return figure
-
-
-def chart_states(state: np.ndarray, labels: Sequence[str], rate: float, colors: Sequence[str],
-                 names: Sequence[str] = ()) -> Any:
-    """Draw the state (T, L) int of every marker over time; where frames share a pixel, the highest.
-
-    Each state has a colour; the legend shows the names of those that occur.
-    """
-    from matplotlib.colors import ListedColormap
-    from matplotlib.patches import Patch
-
-    # 600 columns are as many as the chart has pixels
-    steps = np.array_split(np.arange(len(state)), min(len(state), 600))
-    shown = np.array([state[part].max(axis=0) for part in steps])
-    figure, axes = chart(7.5, 0.6 + 0.13 * len(labels))
-    axes.imshow(shown.T, aspect="auto", interpolation="nearest", vmin=0, vmax=len(colors) - 1,
-                cmap=ListedColormap(list(colors)), extent=(0, len(state) / rate, len(labels) - 0.5, -0.5))
-    axes.set_yticks(range(len(labels)), labels, fontsize=6)
-    axes.set_xlabel("time (s)")
-    if names:
-        patches = [Patch(color=colors[i], label=names[i]) for i in np.unique(state)]
-        axes.legend(handles=patches, frameon=False, fontsize=8, ncols=len(names), loc="upper center",
-                    bbox_to_anchor=(0.5, -0.52 / figure.get_figheight()))
     return figure

@@ -72,8 +72,7 @@ class QuietWork(MoshTask):
 
     def __call__(self, actor, room):
         with small_pictures(), pytest.MonkeyPatch.context() as patch:
-            for chart in ("chart_frames", "chart_timeline"):
-                patch.setattr(report, chart, lambda take: None)
+            patch.setattr(report, "chart_residuals", lambda motion: None)
             patch.setattr(Page, "chart", lambda page, *_rest: page)
             return super().__call__(actor, room)
 

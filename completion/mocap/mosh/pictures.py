@@ -1,13 +1,11 @@
-"""Pictures of a person with markers and of its soft tissue; charts of the distance of markers from the body."""
+"""Pictures of a person with markers and of its soft tissue."""
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 
 from model.body import BodyModel
-from scanprep.cli import MM
 from scanprep.geometry.mesh import Mesh
 from scanprep.pictures.camera import look_around, stance
 from scanprep.pictures.scene import Pane, picture_panes
@@ -15,11 +13,8 @@ from scanprep.pictures.shading import Bones, Dots, Heat, Shape, Solid
 
 from ...motion_pictures import (
     MARKER,
-    chart,
-    chart_states,
     facing,
     frames_to_play,
-    mean_over,
     moving_pane,
     upwards,
 )
@@ -95,42 +90,3 @@ def change_of_place(body: Mesh, layout: MarkerLayout, found: MarkerLayout) -> tu
     axes = np.stack([vertical, ahead, np.cross(vertical, ahead)])
     places = found.place(body)
     return places, (places - layout.place(body)) @ axes.T
-
-
-STATES = {"believed": "#e3eaf0", "not believed": "#f0c46c", "missing": "#9aa3ab", "swapped": "#2f6db3",
-          "slipped": "#8557a8", "noisy": "#b3592f", "stray": "#c02a3c"}
-
-
-def chart_frames(take: Take) -> Any:
-    """Plot the mean distance of the markers over time: fixed shape, soft tissue."""
-    # one line each, averaged to a readable number of points
-    figure, axes = chart(7.8, 2.7)
-    lines = [("fixed shape", take.motion.residuals, "#7a8794")]
-    if take.soft is not None:
-        lines.append(("with soft tissue", take.soft.motion.residuals, "#c8452f"))
-    for label, residuals, color in lines:
-        values = mean_over(residuals, 1)
-        # at most 900 stretches of equal length, as a chart has no more pixels
-        parts = np.array_split(MM * values, min(900, len(values)))
-        shown = np.stack([mean_over(part, 0) for part in parts])
-        axes.plot(np.linspace(0, take.motion.times[-1], len(shown)), shown, color=color, linewidth=1.1,
-                  label=f"{label}: {MM * np.nanmean(values):.1f} mm")
-    axes.set(xlabel="time (s)", ylabel="distance (mm)", ylim=(0, None), xlim=(0, max(take.motion.times[-1], 1e-9)))
-    axes.legend(frameon=False, fontsize=8, ncols=3, loc="upper center", bbox_to_anchor=(0.5, 1.16))
-    return figure
-
-
-def chart_timeline(take: Take) -> Any:
-    """Plot the state of every marker over time: seen, distrusted, missing, swapped, or a bad span."""
-    markers, found, names = take.markers, take.artefacts, list(STATES)
-    labels = [label for label in markers.labels if label in found.labels_touched or label in found.labels]
-    columns = [markers.labels.index(label) for label in labels]
-    # 0 trusted, 1 distrusted, 2 missing, then the kinds of artefacts
-    uncertain = np.isfinite(take.motion.residuals[:, columns]) & ~take.motion.trusted[:, columns]
-    state = np.where(markers.seen[:, columns], uncertain.astype(int), names.index("missing"))
-    for swap in found.swaps:
-        for label in (swap.first, swap.second):
-            state[swap.begin:swap.end + 1, labels.index(label)] = names.index("swapped")
-    for span in found.bad:
-        state[span.begin:span.end + 1, labels.index(span.label)] = names.index(span.kind)
-    return chart_states(state, labels, markers.rate, tuple(STATES.values()), tuple(names))

@@ -15,14 +15,13 @@ from scanprep.pictures.scene import picture_pane
 from scanprep.pictures.shading import contact_sheet
 from scanprep.pictures.sheets import webp_bytes
 
-from ...motion_pictures import marker_rows, mean_over, worst_frames
+from ...motion_pictures import chart_residuals, mean_over, show_markers, worst_frames
 from ..files.force_plates import GroundReactions
 from ..gait.cycles import GaitCycles
 from ..gait.pictures import chart_cycles, chart_forces
 from ..marker_sets.layout import MarkerLayout
 from . import pictures
 from .mosh import MoshResult
-from .pictures import chart_frames, chart_timeline
 from .takes import Take
 
 
@@ -87,18 +86,10 @@ def take_page(take: Take, metrics: Sequence[Metric], picture: np.ndarray, gait: 
         520, webp_bytes(picture))
     show_walk(page, gait, reactions)
     page.section("Distance of the markers", "From where the body has them to where they were measured.")
-    page.chart(chart_frames(take), "mean of the markers, over time")
+    page.chart(chart_residuals(take.shown), "mean of the markers, over time")
     page.bodies(pictures.take_frame_panes(take, worst_frames(take.shown, 5)), "the frames in which they are farthest",
                 300)
-    # a table of markers, the worst first
-    rows = marker_rows(motion.labels, motion.residuals, None if take.soft is None else take.soft.motion.residuals,
-                       motion.trusted)
-    page.table(rows, ("marker", "fixed shape (mm)", "soft tissue (mm)", "95th percentile (mm)", "seen (%)",
-                      "believed (%)"))
-    used = np.isfinite(motion.residuals).any(axis=0)
-    unused = [label for label, is_used in zip(motion.labels, used, strict=True) if not is_used]
-    if unused:
-        page.text(f"Not used, because the layout does not know them or they were never seen: {', '.join(unused)}.")
+    show_markers(page, motion, None if take.soft is None else take.soft.motion)
     if take.soft is not None:
         page.section("Soft tissue", "The skin may move in every frame, as flesh does and as a pose model with one "
                      "fixed shape cannot. What it takes up may also be markers that slide with the skin.")
@@ -117,7 +108,7 @@ def take_page(take: Take, metrics: Sequence[Metric], picture: np.ndarray, gait: 
                    ("artefact", "marker", "first frame", "last frame", "lasts (s)", "distance (mm)"))
     else:
         page.text("None was found.")
-    return page.chart(chart_timeline(take), "every marker over time")
+    return page
 
 
 def show_walk(page: Page, gait: GaitCycles | None, reactions: GroundReactions | None) -> None:
