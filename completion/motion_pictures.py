@@ -1,6 +1,7 @@
 """Pictures and charts of a body in motion."""
 from __future__ import annotations
 
+import functools
 import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -15,8 +16,8 @@ from scanprep.geometry.farthest_points import spread_indices
 from scanprep.geometry.mesh import Mesh
 from scanprep.pictures.camera import Camera, look_around, stance
 from scanprep.pictures.page import Page
-from scanprep.pictures.scene import Pane
-from scanprep.pictures.shading import Dots, Moving, Solid, contact_sheet, render
+from scanprep.pictures.scene import Pane, match_camera_scales, picture_pane
+from scanprep.pictures.shading import Dots, Moving, Solid, contact_sheet
 
 from .motion import Motion
 
@@ -63,6 +64,7 @@ class LightMesh:
     faces: np.ndarray
 
     @staticmethod
+    @functools.lru_cache(maxsize=2)          # the same for all motions of a person
     def of(template: Mesh) -> LightMesh:
         """Simplify a template; one with few triangles is kept."""
         light = 7000  # triangles that suffice for small pictures and motions
@@ -86,8 +88,7 @@ def frames_to_play(motion: Motion) -> tuple[np.ndarray, float]:
 
 
 def moving_pane(motion: Motion, subject: Subject, dots: Sequence[tuple[Dots, np.ndarray]] = (),
-                bodies: Bodies | None = None, light: LightMesh | None = None, color: Sequence[float] | None = None
-                ) -> Pane:
+                bodies: Bodies | None = None, color: Sequence[float] | None = None) -> Pane:
     """Make a pane of a body in motion, with dots; the body stays in the middle of the picture.
 
     Parameters
@@ -100,8 +101,6 @@ def moving_pane(motion: Motion, subject: Subject, dots: Sequence[tuple[Dots, np.
         Dots, and their places in the frames of `frames_to_play`.
     bodies : callable, optional
         Returns vertices (n, N, 3), metres, of frames (n,), if not those of the subject.
-    light : LightMesh, optional
-        The simplified mesh, if it is known already.
     color : (3,) float, optional
         Colour of the body.
 
@@ -110,7 +109,7 @@ def moving_pane(motion: Motion, subject: Subject, dots: Sequence[tuple[Dots, np.
     Pane
     """
     frames, rate = frames_to_play(motion)
-    light = light or LightMesh.of(subject.template)
+    light = LightMesh.of(subject.template)
     make = bodies or (lambda chosen: motion.vertices(subject, chosen))
     # 128 full bodies in memory at a time
     shown = np.concatenate([make(frames[i:i + 128])[:, light.vertex_ids].astype(np.float32)
@@ -138,14 +137,13 @@ def pane_with_dots(motion: Motion, subject: Subject, places: np.ndarray, name: s
     return moving_pane(motion, subject, [(Dots(at[0], MARKER, 0.013, on_top, name=name, labels=labels), at)])
 
 
-def frame_panes(motion: Motion, subject: Subject, markers: np.ndarray | None, frames: np.ndarray, turn: float = TURN
+def frame_panes(motion: Motion, subject: Subject, markers: np.ndarray, frames: np.ndarray, turn: float = TURN
                 ) -> list[Pane]:
     """Make a pane for each of some frames, with measured markers (T, L, 3), metres, as dots."""
     panes, light, vertical = [], LightMesh.of(subject.template), upwards(motion, subject)
     for t, vertices, time in zip(frames, motion.vertices(subject, frames), seconds(motion, frames), strict=True):
-        dots = [] if markers is None else [Dots(markers[t], MARKER, radius=0.013)]
         camera = facing(subject, motion.poses[t], vertices, turn, vertical)
-        panes.append(Pane([light.mesh(vertices), *dots], camera, time))
+        panes.append(Pane([light.mesh(vertices), Dots(markers[t], MARKER, radius=0.013)], camera, time))
     return panes
 
 
@@ -157,17 +155,10 @@ def seconds(motion: Motion, frames: np.ndarray) -> list[str]:
 def bodies_in_a_row(subject: Subject, poses: np.ndarray, bodies: np.ndarray, colors: np.ndarray | None = None,
                     height: int = 360) -> list[np.ndarray]:
     """Render bodies (n, N, 3) in poses (n, J, 3) at one scale; `colors` (n, N, 3) are of their vertices."""
-    size, images = 1.06 * np.ptp(bodies, axis=1).max(axis=0) / 2, []
     vertical = stance(subject.template, rotations.exp(poses[:, 0]))[0]
-    up, sign = int(np.abs(vertical).argmax()), vertical.sum()
-    floor = sign * (sign * bodies[..., up]).min()
-    for i, body in enumerate(bodies):
-        middle = (body.min(axis=0) + body.max(axis=0)) / 2
-        middle[up] = floor + sign * size[up] / 1.06                        # all stand on one line
-        camera = facing(subject, poses[i], np.stack([middle - size, middle + size]), vertical=vertical)
-        images.append(render(Solid(subject.template.with_vertices(body), None if colors is None else colors[i]), camera,
-                             int(0.62 * height), height))
-    return images
+    panes = [Pane([Solid(subject.template.with_vertices(body), None if colors is None else colors[i])],
+                  facing(subject, poses[i], body, vertical=vertical)) for i, body in enumerate(bodies)]
+    return [picture_pane(pane, int(0.62 * height), height) for pane in match_camera_scales(panes)]
 
 
 def picture_bodies(motion: Motion, subject: Subject, bodies: np.ndarray, frames: np.ndarray) -> np.ndarray:

@@ -11,7 +11,7 @@ from completion_bodies import MEAN, worm_with_prior
 from config_files import config_file
 from quiet_pictures import render
 
-from completion import MarkerLayout, MarkerSequence, motion_pictures, write_markers
+from completion import MarkerLayout, MarkerSequence, write_markers
 from completion.__main__ import main
 from completion.mocap.mosh import cli, report
 from completion.mocap.mosh.work import MoshTask
@@ -62,8 +62,7 @@ def run(place, *words, **settings):
 def small_pictures():
     """Nobody looks at them here."""
     with pytest.MonkeyPatch.context() as patch:
-        for module in (scene, motion_pictures):
-            patch.setattr(module, "render", render)
+        patch.setattr(scene, "render", render)
         yield
 
 

@@ -79,7 +79,7 @@ def test_everything_is_in_the_page(folder):
     assert [pane["label"] for pane in first] == ["scan", "the template on it"]
     assert first[0]["camera"] == first[1]["camera"]
     registered = turning[0].layer("registered template")
-    assert [shade["name"] for shade in registered["shades"]] == ["distance to the scan", "confidence", "plain"]
+    assert [shade["name"] for shade in registered["shades"]] == ["distance to the scan", "not sure", "plain"]
 
 
 def test_a_long_page_leaves_pictures_in_the_folder(folder, monkeypatch):
@@ -198,7 +198,7 @@ def test_missed_points(template):
     second = template.corners.reshape(-1, 3) + [3, 0, 0]
     faces = np.concatenate([template.faces, len(template.vertices) + np.arange(len(second)).reshape(-1, 3)])
     both = Mesh(np.concatenate([template.vertices, second]), faces)
-    assert share_uncovered(both, template, 0.01, samples=len(both.vertices)) == pytest.approx(0.5, abs=1e-6)
+    assert share_uncovered(both, template, 0.01) == pytest.approx(0.5, abs=0.01)
 
 
 def test_tables_keep_their_numbers(tmp_path):

@@ -63,7 +63,7 @@ def test_heat_goes_over_in_254_steps_and_without_a_value_is_grey(body):
     values = np.linspace(-0.001, 0.012, len(body.vertices))
     values[7] = np.nan
     shade = Heat(values, 0.0, 0.01, "distance")
-    sure = Heat(values, 0, 1, "sure", "%", "Blues")
+    sure = Heat(values, 0, 1, "sure", "%")
     read = SceneReader(pack_scene([pane(Solid(body, shade, shades={"sure": sure}))]))
     first, sure = read.layers[0]["shades"]
     index = read.columns[first["index"]].ravel()
@@ -72,7 +72,7 @@ def test_heat_goes_over_in_254_steps_and_without_a_value_is_grey(body):
     assert index[7] == 255
     assert first["legend"] == {"title": "distance", "low": 0.0, "high": 0.01, "unit": "mm", "more": True}
     np.testing.assert_allclose(read.colors(first, 0) / 255, shade.colors(), atol=0.02)
-    assert sure["name"] == "sure" and sure["legend"]["unit"] == "%" and sure["palette"] != first["palette"]
+    assert sure["name"] == "sure" and sure["legend"]["unit"] == "%"
 
 
 def test_colours_of_vertices_and_triangles(body):

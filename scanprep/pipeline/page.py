@@ -8,7 +8,6 @@ from pathlib import Path
 from urllib.parse import quote
 
 import numpy as np
-from scipy.sparse import eye_array
 
 from ..dataset import RegisteredSet, SetEntry
 from ..geometry import rotations
@@ -19,9 +18,10 @@ from ..judgement import Judgement, judge_many
 from ..judgement import size as size_of
 from ..pictures.camera import Camera, look_around
 from ..pictures.page import Page, data_uri
-from ..pictures.scene import Pane, embed_files, small_scene, worst_that_turn
+from ..pictures.scene import SMALL, Pane, embed_files, small_scene, worst_that_turn
 from ..pictures.shading import CLAY, Dots, Heat, Shape, Solid, color_bar, part_colors, render
 from ..pictures.sheets import webp_bytes
+from ..pictures.thinning import thin_solid
 from ..registration.figures import (
     UNSEEN,
     Limits,
@@ -59,7 +59,7 @@ def write_set_page(folder: str | Path, limits: Limits | None = None, to: Path | 
     page = Page(f"Scans of {folder.absolute().name}",
                 f"{number_of(len(verdicts), 'scan')}: {', '.join(parts) or 'all within their limits'}.")
     page.verdict(judge_whole(verdicts, registered, limits))
-    page.markup("", Path(__file__).with_name("page.css").read_text(encoding="utf-8"))
+    page.markup(f"<style>{Path(__file__).with_name('page.css').read_text(encoding='utf-8')}</style>")
     page.table(_summary(verdicts), ("", "median", "worst", "unit"))
     page.section("Subjects", "Every scan, by subject: green is fine, amber needs a look, red could not be registered.")
     page.markup(_index(verdicts, entries))
@@ -234,46 +234,22 @@ def pictures_of(template: Mesh, scan: Mesh | np.ndarray, fit: Registration) -> t
     front, back = (replace(c, width=1.06 * c.width, height=1.06 * c.height)
                    for c in look_around(template, body.vertices, (TURN, TURN + 180)))
     # the scan, turned like the body, with only as much detail as a small picture shows
-    size, ball = size_of(template), 0.013 * size_of(template)
+    size = size_of(template)
     raw: Solid | Dots
     if isinstance(scan, Mesh) and len(scan.faces):
-        coarse = cluster_vertices(scan, 0.007 * size)
-        raw = Solid(coarse.with_vertices((coarse.vertices - middle) @ R.T))
+        raw = thin_solid(Solid(scan.with_vertices((scan.vertices - middle) @ R.T)), SMALL)
     else:
         points = scan.vertices if isinstance(scan, Mesh) else scan
+        ball = 0.013 * size
         raw = Dots((points[thin(points, 1.25 * ball)] - middle) @ R.T, CLAY, ball)
-    far = Heat(smooth_values(body, fit.distances), 0, FAR * size, "distance to the scan")
-    sure = Heat(1 - fit.confidence, -0.35, 1, colormap="Blues")     # not the colours of the distances
+    far = Heat(fit.distances, 0, FAR * size, "distance to the scan")
+    sure = Heat(1 - fit.confidence, 0, 1)
     shown: list[tuple[Shape, Camera]] = [
         (raw, front), (Solid(body, CLAY), front), (Solid(body, far), front), (Solid(body, far), back),
         (Solid(body, sure), front)]
     strip = webp_bytes(np.concatenate([render(shape, camera, WIDTH, HEIGHT) for shape, camera in shown], axis=1))
     # for the browser: the body in several colourings, the scan over it hidden at first
     registered = Solid(body, far, name="registered template", shades={
-        "confidence": Heat(fit.confidence, 0, 1, "confidence", "%", "Blues_r"), "plain": np.array(CLAY)})
+        "not sure": Heat(1 - fit.confidence, 0, 1, "not sure", "%"), "plain": np.array(CLAY)})
     over = replace(raw, name="scan over it", visible=False)
     return strip, small_scene([Pane([raw], front, "scan"), Pane([registered, over], front, "the template on it")])
-
-
-def smooth_values(mesh: Mesh, values: np.ndarray) -> np.ndarray:
-    """Average values (N,) with those of neighbours, so that noise fades and misfit stays; NaN stays NaN."""
-    known = np.isfinite(values)
-    weights = mesh.vertex_adjacency.astype(float) + eye_array(len(values))
-    # two rounds reach the second ring of neighbours
-    for _ in range(2):
-        total = weights @ np.where(known, values, 0.0)
-        values = np.where(known, total / np.maximum(weights @ known.astype(float), 1.0), np.nan)
-    return values
-
-
-def cluster_vertices(mesh: Mesh, cell: float) -> Mesh:
-    """Merge the vertices inside each cubic cell (metres); for pictures only, as it may not be manifold."""
-    key = np.floor((mesh.vertices - mesh.vertices.min(axis=0)) / cell).astype(np.int64)
-    _, first, place = np.unique(key, axis=0, return_index=True, return_inverse=True)
-    faces = place.reshape(-1)[mesh.faces]
-    # triangles inside one cell have collapsed
-    apart = (faces[:, 0] != faces[:, 1]) & (faces[:, 1] != faces[:, 2]) & (faces[:, 2] != faces[:, 0])
-    count = np.bincount(place.reshape(-1))
-    means = np.stack([np.bincount(place.reshape(-1), axis) / count for axis in mesh.vertices.T], axis=1)
-    colors = None if mesh.colors is None else mesh.colors[first]
-    return Mesh(means, faces[apart], colors)

@@ -11,14 +11,10 @@ from scanprep.pictures.camera import look_around, stance
 from scanprep.pictures.scene import Pane, picture_panes
 from scanprep.pictures.shading import Bones, Dots, Heat, Shape, Solid
 
-from ...motion_pictures import (
-    MARKER,
-    facing,
-    frames_to_play,
-    moving_pane,
-    upwards,
-)
+from ...motion_pictures import MARKER, frames_to_play, moving_pane
 from ..marker_sets.layout import MarkerLayout
+from ..soft_tissue.soft_tissue import SoftTissue
+from .mosh import MoshResult
 from .takes import Take
 
 USUAL, UNCERTAIN = (0.30, 0.50, 0.72), (0.93, 0.62, 0.16)
@@ -29,11 +25,11 @@ def person_in_mean_pose(model: BodyModel, betas: np.ndarray) -> Mesh:
     return model.template.with_vertices(model.vertices(model.pose_mean, betas))
 
 
-def picture_sides(body: Mesh, found: np.ndarray) -> np.ndarray:
-    """Render a body with its markers (L, 3) from four sides."""
-    shapes: list[Shape] = [Solid(body), Dots(found, MARKER, 0.011)]
-    sides = zip(look_around(body), ("front", "left", "back", "right"), strict=True)
-    return picture_panes([Pane(shapes, camera, side) for camera, side in sides], 360)
+def person_picture(model: BodyModel, result: MoshResult) -> np.ndarray:
+    """Render a person with the markers from four sides, for the page of all people."""
+    body = person_in_mean_pose(model, result.betas)
+    shapes: list[Shape] = [Solid(body), Dots(result.layout.place(body), MARKER, 0.011)]
+    return picture_panes([Pane(shapes, camera) for camera in look_around(body)], 360)
 
 
 def person_pane(body: Mesh, found: np.ndarray, usual: np.ndarray, labels: Sequence[str]) -> Pane:
@@ -58,25 +54,12 @@ def take_pane(take: Take) -> Pane:
     frames, _ = frames_to_play(take.shown)
     dots = [(Dots(at[0], color, 0.013, name=name, labels=take.markers.labels), at[frames])
             for name, (color, at) in kinds_of_markers(take).items()]
-    return moving_pane(take.shown, take.subject, dots, take.make, take.light)
+    return moving_pane(take.shown, take.subject, dots, take.make)
 
 
-def take_frame_panes(take: Take, frames: np.ndarray) -> list[Pane]:
-    """Return some frames with their markers."""
-    vertical, panes = upwards(take.shown, take.subject), []
-    for t, body in zip(frames.tolist(), take.bodies(frames), strict=True):
-        dots = [Dots(at[t], color, 0.014, name=name) for name, (color, at) in kinds_of_markers(take).items()]
-        panes.append(Pane([take.light.mesh(body), *dots],
-                          facing(take.subject, take.shown.poses[t], body, vertical=vertical),
-                          f"{t} · {t / take.shown.rate:.2f} s"))
-    return panes
-
-
-def soft_pane(take: Take, frames: np.ndarray) -> Pane:
-    """Return a body coloured by the root mean square displacement of soft tissue over some frames."""
-    change = np.sqrt(((take.bodies(frames) - take.rigid(frames))**2).sum(axis=2).mean(axis=0))
-    body = take.subject.template.with_vertices(
-        take.subject.vertices(take.model.pose_mean).astype(float))
+def soft_pane(model: BodyModel, soft: SoftTissue) -> Pane:
+    """Return a body coloured by how far soft tissue moves the skin, root mean square over time."""
+    body, change = person_in_mean_pose(model, soft.motion.betas), soft.movement(model)
     # 0.005 metres at least, so that tiny changes stay pale
     end = max(float(np.percentile(change, 99.5)), 0.005)
     shown = Heat(change, 0, end, "change of the skin, root mean square over time")

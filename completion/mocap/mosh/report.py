@@ -9,13 +9,12 @@ from model.body import BodyModel
 from scanprep.cli import MM
 from scanprep.console import Metric
 from scanprep.folders import add_entry, as_line
-from scanprep.geometry.farthest_points import spread_indices
 from scanprep.pictures.page import Page
 from scanprep.pictures.scene import picture_pane
 from scanprep.pictures.shading import contact_sheet
 from scanprep.pictures.sheets import webp_bytes
 
-from ...motion_pictures import chart_residuals, mean_over, show_markers, worst_frames
+from ...motion_pictures import chart_residuals, frame_panes, mean_over, show_markers, worst_frames
 from ..files.force_plates import GroundReactions
 from ..gait.cycles import GaitCycles
 from ..gait.pictures import chart_cycles, chart_forces
@@ -87,15 +86,13 @@ def take_page(take: Take, metrics: Sequence[Metric], picture: np.ndarray, gait: 
     show_walk(page, gait, reactions)
     page.section("Distance of the markers", "From where the body has them to where they were measured.")
     page.chart(chart_residuals(take.shown), "mean of the markers, over time")
-    page.bodies(pictures.take_frame_panes(take, worst_frames(take.shown, 5)), "the frames in which they are farthest",
-                300)
+    page.bodies(frame_panes(motion, take.subject, take.markers.positions, worst_frames(take.shown, 5)),
+                "the frames in which they are farthest", 300)
     show_markers(page, motion, None if take.soft is None else take.soft.motion)
     if take.soft is not None:
         page.section("Soft tissue", "The skin may move in every frame, as flesh does and as a pose model with one "
                      "fixed shape cannot. What it takes up may also be markers that slide with the skin.")
-        # over 56 frames
-        frames = spread_indices(len(take.shown.poses), 56)
-        page.bodies([pictures.soft_pane(take, frames)], "where the body changes most")
+        page.bodies([pictures.soft_pane(take.model, take.soft)], "where the body changes most")
     page.section("Marker artefacts", "The body says where each marker should be: one that is elsewhere was "
                  "swapped with another, has slipped, jitters or strays.")
     # a table of artefacts, in order of time
@@ -127,16 +124,10 @@ def show_walk(page: Page, gait: GaitCycles | None, reactions: GroundReactions | 
             page.text(f"{note[0].upper()}{note[1:]}.")
 
 
-def person_picture(model: BodyModel, result: MoshResult) -> np.ndarray:
-    """Render a person with the markers from four sides, for the page of all people."""
-    body = pictures.person_in_mean_pose(model, result.betas)
-    return pictures.picture_sides(body, result.layout.place(body))
-
-
 def take_picture(take: Take) -> np.ndarray:
     """Render six frames of a sequence, for the page of its person."""
     frames = np.unique(np.linspace(0, len(take.motion.poses) - 1, 8).round().astype(int)[1:-1])
-    panes = pictures.take_frame_panes(take, frames)
+    panes = frame_panes(take.motion, take.subject, take.markers.positions, frames)
     return contact_sheet([picture_pane(pane, 161, 260) for pane in panes], [pane.label for pane in panes])
 
 
