@@ -66,10 +66,7 @@ def statue_page(name: str, scan: Mesh, statue: Statue, levels: Sequence[Level], 
         Dots(joints, radius=0.0085 * size(control.mesh), on_top=True, name="joints", labels=control.skeleton.names),
         Dots(control.mesh.vertices[marks], (0.15, 0.45, 0.75), 0.006, True, name="feature points", labels=names)],
                       place_camera(statue, scan, 20))], height=HEIGHT)
-    page.section("Levels of detail, and their distance to the scan", "The same map on ever fewer triangles. Grey: "
-                 "holes of the scan, which do not count.")
-    page.table([(one.name, len(one.mesh.vertices), f"{1000 * one.mean:.2f}", f"{1000 * one.rms:.2f}")
-                for one in levels], ("level", "vertices", "mean, mm", "RMS, mm"))
+    page.section("Distance to the scan", "Grey: holes of the scan, which do not count.")
     finest = levels[-1]
     far = Surface(scan).closest(finest.mesh.vertices).distances
     far[finest.mesh.faces[~finest.shown]] = np.nan

@@ -61,9 +61,8 @@ def write_set_page(folder: str | Path, limits: Limits | None = None, to: Path | 
     page.verdict(judge_whole(verdicts, registered, limits))
     page.markup(f"<style>{Path(__file__).with_name('page.css').read_text(encoding='utf-8')}</style>")
     page.table(_summary(verdicts), ("", "median", "worst", "unit"))
-    page.section("Subjects", "Every scan, by subject: green is fine, amber needs a look, red could not be registered.")
-    page.markup(_index(verdicts, entries))
-    page.section("Worst first", _explanation(limits, size))
+    page.section("Worst first", "Green is fine, amber needs a look, red could not be registered.\n\n"
+                 + _explanation(limits, size))
     page.picture(color_bar(0, FAR * size, "distance to the scan; grey: no data there"))
     # pictures and scenes of the worst scans are carried by the page, as far as its size allows
     shots = [folder / pictures_place(entries.get(verdict.name)) / verdict.name for verdict in verdicts]
@@ -156,23 +155,6 @@ def _explanation(limits: Limits, size: float) -> str:
         "does both in the browser.")
 
 
-def _index(verdicts: Sequence[Verdict], entries: dict[str, SetEntry]) -> str:
-    """Return HTML with a link to every scan, grouped by subject."""
-    groups: dict[str, list[tuple[str, Verdict]]] = {}
-    for verdict in sorted(verdicts, key=lambda v: v.name):
-        entry = entries.get(verdict.name)
-        subject = entry.subject if entry else ""
-        groups.setdefault(subject or "not registered", []).append((entry.pose if entry else "", verdict))
-    parts = []
-    for subject, members in sorted(groups.items()):
-        links = "".join(f'<a href="#{_anchor(v)}" title="{escape(v.name)}"><span class="dot {_mark(v)}"></span>'
-                        f"{escape(pose or v.name)}</a>" for pose, v in members)
-        # a subject with one scan of the same name needs no heading
-        alone = len(members) == 1 and members[0][1].name == subject
-        parts.append(f"<span>{'' if alone else f'<b>{escape(subject)}</b>'}{links}</span>")
-    return f'<div class="index">{"".join(parts)}</div>'
-
-
 def _card(verdict: Verdict, entry: SetEntry | None, shown: str, rival: str) -> str:
     """Return HTML of one scan: its figures, reasons and pictures."""
     f, table = verdict.figures, ""
@@ -193,7 +175,7 @@ def _card(verdict: Verdict, entry: SetEntry | None, shown: str, rival: str) -> s
                 *([("right within 20 mm, probability", f"{100 * verdict.right:.0f}%")] if verdict.right >= 0 else []))
         table = "<table>" + "".join(f'<tr><td>{name}</td><td class="number">{value}</td></tr>'
                                     for name, value in rows) + "</table>"
-    return (f'<section class="scan {_mark(verdict)}" id="{_anchor(verdict)}"><h3><span class="dot"></span>'
+    return (f'<section class="scan {_mark(verdict)}"><h3><span class="dot"></span>'
             f"{escape(verdict.name)} <small>{badness}</small><small>{escape(about)}</small></h3>"
             f"<ul>{reasons}</ul>{shown}{table}"
             + (f"<div><h4>the other body that explains the scan</h4>{rival}</div>" if rival else "") + "</section>")
@@ -215,11 +197,6 @@ def _scan_view(page: Page, folder: Path, place: Path, name: str, picture: bytes 
 def _mark(verdict: Verdict) -> str:
     """Return the CSS class of a verdict."""
     return "failed" if verdict.failed else "look" if verdict.suspect else "fine"
-
-
-def _anchor(verdict: Verdict) -> str:
-    """Return the HTML id of a scan."""
-    return "scan-" + escape(verdict.name.replace(" ", "_"))
 
 
 def pictures_of(template: Mesh, scan: Mesh | np.ndarray, fit: Registration) -> tuple[bytes, bytes]:

@@ -7,12 +7,11 @@ import numpy as np
 
 from model.body import BodyModel
 from scanprep.geometry.mesh import Mesh
-from scanprep.pictures.camera import look_around, stance
+from scanprep.pictures.camera import look_around
 from scanprep.pictures.scene import Pane, picture_panes
 from scanprep.pictures.shading import Bones, Dots, Heat, Shape, Solid
 
 from ...motion_pictures import MARKER, frames_to_play, moving_pane
-from ..marker_sets.layout import MarkerLayout
 from ..soft_tissue.soft_tissue import SoftTissue
 from .mosh import MoshResult
 from .takes import Take
@@ -57,19 +56,11 @@ def take_pane(take: Take) -> Pane:
     return moving_pane(take.shown, take.subject, dots, take.make)
 
 
-def soft_pane(model: BodyModel, soft: SoftTissue) -> Pane:
+def soft_pane(take: Take, soft: SoftTissue) -> Pane:
     """Return a body coloured by how far soft tissue moves the skin, root mean square over time."""
-    body, change = person_in_mean_pose(model, soft.motion.betas), soft.movement(model)
+    body = take.subject.template.with_vertices(take.subject.vertices(take.model.pose_mean).astype(float))
+    change = soft.movement(take.model)
     # 0.005 metres at least, so that tiny changes stay pale
     end = max(float(np.percentile(change, 99.5)), 0.005)
     shown = Heat(change, 0, end, "change of the skin, root mean square over time")
     return Pane([Solid(body, shown)], look_around(body, turns=(20,))[0])
-
-
-def change_of_place(body: Mesh, layout: MarkerLayout, found: MarkerLayout) -> tuple[np.ndarray, np.ndarray]:
-    """Compute places (L, 3), metres, of markers on a body, and the way from usual places: up, forward, left (L, 3)."""
-    # axes of the body: up, forward, left
-    vertical, ahead = stance(body)
-    axes = np.stack([vertical, ahead, np.cross(vertical, ahead)])
-    places = found.place(body)
-    return places, (places - layout.place(body)) @ axes.T

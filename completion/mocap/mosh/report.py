@@ -29,12 +29,13 @@ def person_page(name: str, model: BodyModel, result: MoshResult, usual: MarkerLa
     """Make the page of a person: shape, markers before and after, links to its sequences and their figures."""
     body, labels, misplaced = pictures.person_in_mean_pose(model, result.betas), result.layout.labels, result.misplaced
     before = usual.select(labels)
-    found, moved = pictures.change_of_place(body, before, result.layout)
+    found, places = result.layout.place(body), before.place(body)
+    moved = np.linalg.norm(found - places, axis=1)
     # the body with its markers, and the sequences
     page = Page(f"{name}: body shape and markers",
                 f"Found from the markers of {len(takes)} {'sequence' if len(takes) == 1 else 'sequences'} alone.")
-    ways = [f"{label}: {MM * far:.0f} mm" for label, far in zip(labels, np.linalg.norm(moved, axis=1), strict=True)]
-    page.bodies([pictures.person_pane(body, found, before.place(body), ways)],
+    ways = [f"{label}: {MM * far:.0f} mm" for label, far in zip(labels, moved, strict=True)]
+    page.bodies([pictures.person_pane(body, found, places, ways)],
                 "the body in the mean pose of the model's people; red: where the markers sat, blue: where the layout "
                 "has them, with a rod from the one to the other", 520)
     page.section("Sequences")
@@ -59,14 +60,12 @@ def person_page(name: str, model: BodyModel, result: MoshResult, usual: MarkerLa
         for label, column in zip(take.motion.labels, take.motion.residuals.T, strict=True):
             left.setdefault(label, []).append(column)
     lifts = np.asarray(before.distances), np.asarray(result.layout.distances)
-    rows = [(label, MM * float(np.linalg.norm(moved[i])), *(MM * moved[i]).round(1).tolist(),
-             *(MM * float(lift[i]) for lift in lifts),
+    rows = [(label, MM * float(moved[i]), *(MM * float(lift[i]) for lift in lifts),
              MM * float(mean_over(np.concatenate(left.get(label, [np.array([np.nan])])), 0)))
             for i, label in enumerate(before.labels)]
     page.section("Markers before and after", "From where the layout has each marker to where it was found.")
     page.table(sorted(rows, key=lambda row: -row[1]),
-               ("marker", "moved (mm)", "up (mm)", "forward (mm)", "to the left (mm)", "off the skin, layout (mm)",
-                "found (mm)", "distance left, fixed shape (mm)"))
+               ("marker", "moved (mm)", "off the skin, layout (mm)", "found (mm)", "distance left, fixed shape (mm)"))
     if before.loose:
         page.text(f"Loose markers, which may sit anywhere on their limb: {', '.join(before.loose)}.")
     return page.section("Figures").figures(metrics)
@@ -92,7 +91,7 @@ def take_page(take: Take, metrics: Sequence[Metric], picture: np.ndarray, gait: 
     if take.soft is not None:
         page.section("Soft tissue", "The skin may move in every frame, as flesh does and as a pose model with one "
                      "fixed shape cannot. What it takes up may also be markers that slide with the skin.")
-        page.bodies([pictures.soft_pane(take.model, take.soft)], "where the body changes most")
+        page.bodies([pictures.soft_pane(take, take.soft)], "where the body changes most")
     page.section("Marker artefacts", "The body says where each marker should be: one that is elsewhere was "
                  "swapped with another, has slipped, jitters or strays.")
     # a table of artefacts, in order of time
