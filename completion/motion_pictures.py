@@ -205,18 +205,14 @@ def chart(width: float, height: float) -> tuple[Any, Any]:
     return figure, figure.add_subplot()
 
 
-def chart_residuals(motion: Motion, what: str = "markers", lost: bool = False) -> Any:
-    """Draw the distance of the markers from the body over time; with `lost`, lost frames are shaded."""
+def chart_residuals(motion: Motion, what: str = "markers") -> Any:
+    """Draw the distance of the markers from the body over time."""
     figure, axes = chart(7.5, 2.6)
     shown = np.isfinite(motion.residuals).any(axis=1)
     millimetres = 1000 * motion.residuals[shown]
     axes.fill_between(motion.times[shown], *np.nanpercentile(millimetres, [10, 90], axis=1), alpha=0.25,
                       label="10th to 90th percentile", linewidth=0)
     axes.plot(motion.times[shown], np.nanmean(millimetres, axis=1), linewidth=1.2, label="mean")
-    # begin and end of every run of lost frames
-    edges = np.flatnonzero(np.diff(np.r_[True, motion.converged, True])) if lost else np.zeros(0, dtype=int)
-    for i, span in enumerate((edges.reshape(-1, 2) - 0.5) / motion.rate):
-        axes.axvspan(*span, color="0.85", label="lost" if i == 0 else None)
     axes.set(xlabel="time (s)", ylabel=f"distance of the {what} (mm)", ylim=(0, None))
     axes.legend(frameon=False)
     return figure

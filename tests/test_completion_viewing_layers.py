@@ -16,7 +16,7 @@ from completion.viewing.app import ViewApp
 from completion.viewing.files import Files
 from completion.viewing.motions import of_motion
 from completion.viewing.notebook import view
-from completion.viewing.soft import soft_columns, with_soft_tissue
+from completion.viewing.soft import with_soft_tissue
 from model.files import load_model
 from model.statue.control.files import humanoid
 from model.statue.control.model import FOLDED, MEASURED, DisplacementMap, Statue
@@ -81,18 +81,6 @@ def told(app, layer):
     return np.frombuffer(message.data, "<f4").reshape(-1, 3) + app.cameras[0].target
 
 
-@pytest.mark.parametrize("kind", KINDS)
-def test_soft_tissue_is_columns_times_coefficients(kind):
-    model = KINDS[kind]()
-    soft = soft_motion(model)
-    frames = soft.vertices(model)
-    basis, coefficients = soft_columns(soft, model, frames[::3])
-    assert np.abs(basis @ coefficients - frames).max() < 1e-3 and basis.shape[1] < len(basis) / 4
-    still = SoftTissue(soft.motion, 0 * soft.changes)
-    basis, coefficients = soft_columns(still, model, still.vertices(model, slice(0, 30, 3)))
-    assert np.abs(basis @ coefficients - soft.motion.vertices(model.subject(OWN))).max() < 1e-3
-
-
 @pytest.mark.parametrize("name", ["walk", "walk/soft_tissue.npz"])
 def test_a_motion_is_shown_with_its_soft_tissue(place, name):
     content = Files((place.folder / name,), place.folder / "worm.npz").entries()[0].load()
@@ -112,12 +100,6 @@ def test_markers_are_compared_with_the_body_that_is_seen(place):
     assert [shape.shape.name for shape in content.shapes] == ["fixed shape", "with soft tissue", "markers"]
     assert content.markers.shape == 2 and np.array_equal(content.markers.residuals, residuals)
     assert "with soft tissue" in content.notes[0]
-
-
-def test_a_motion_without_soft_tissue_is_as_before(place, tmp_path):
-    place.soft.motion.save(tmp_path / "motion.npz")
-    content = Files((tmp_path / "motion.npz",), place.folder / "worm.npz").entries()[0].load()
-    assert [(shape.shape.name, shape.shape.visible) for shape in content.shapes] == [("body", True)]
 
 
 @pytest.mark.parametrize("name", ["statue", "statue/statue.json", "statue/control.npz"])

@@ -80,16 +80,6 @@ def test_everything_is_in_the_page(folder):
     assert [shade["name"] for shade in registered["shades"]] == ["distance to the scan", "not sure", "plain"]
 
 
-def test_a_long_page_leaves_pictures_in_the_folder(folder, monkeypatch):
-    """Those of the worst scans are in it, the others come when they are scrolled to."""
-    worst = (folder / "pictures" / "body3.webp").stat().st_size
-    monkeypatch.setattr(pictures, "MOST_CARRIED", worst + 10)
-    page = write_set_page(folder, to=folder.parent).read_text()
-    linked = re.findall(r'<img src="(pictures/[^"]+)"[^>]* loading="lazy"', page)
-    assert len(linked) == 3 and "pictures/body3.webp" not in linked and "data:image/webp" in page
-    assert all((folder / path).is_file() for path in linked)
-
-
 def test_pictures_show_what_they_say(folder):
     """The half that was not scanned is grey on one side; the scan of points looks like a body."""
     from PIL import Image
@@ -114,11 +104,6 @@ def test_names_cannot_break_the_page(folder, tmp_path):
     write_failures(tmp_path / "set", {"d": "<i>broken</i>"})
     page = write_set_page(tmp_path / "set").read_text()
     assert "<script" not in page and "<i>" not in page and "a b&amp;c" in page
-
-
-def test_set_without_scans(tmp_path):
-    RegisteredSet.create(tmp_path / "set", ball(0))
-    assert "0 scans" in write_set_page(tmp_path / "set").read_text()
 
 
 @pytest.mark.parametrize("change, reason", [

@@ -10,7 +10,6 @@ from scanprep.pictures.shading import (
     Camera,
     Dots,
     Solid,
-    color_bar,
     contact_sheet,
     heat,
     part_colors,
@@ -172,11 +171,3 @@ def test_sheets_hold_all_pictures(tmp_path):
     assert np.array_equal(np.asarray(Image.open(tmp_path / "a" / "sheet.png")), sheet)
     assert [p.name for p in (tmp_path / "a").iterdir()] == ["sheet.png"]
     assert png_bytes(sheet).startswith(b"\x89PNG")
-
-
-def test_the_bar_ends_in_the_colours_of_its_values():
-    bar = color_bar(0, 0.02, "distance")
-    row = bar[33].astype(int)
-    ends = (255 * heat(np.array([0.0, 0.02]), 0, 0.02)).round()
-    assert np.abs(row[27] - ends[0]).max() <= 3
-    assert np.abs(row[-28] - ends[1]).max() <= 3
