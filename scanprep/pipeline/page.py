@@ -17,8 +17,8 @@ from ..geometry.mesh import Mesh
 from ..judgement import Judgement, judge_many
 from ..judgement import size as size_of
 from ..pictures.camera import Camera, look_around
-from ..pictures.page import Page, data_uri
-from ..pictures.scene import SMALL, Pane, embed_files, small_scene, worst_that_turn
+from ..pictures.page import Page
+from ..pictures.scene import SMALL, Pane, small_scene, worst_that_turn
 from ..pictures.shading import CLAY, Dots, Heat, Shape, Solid, color_bar, part_colors, render
 from ..pictures.sheets import webp_bytes
 from ..pictures.thinning import thin_solid
@@ -38,7 +38,6 @@ from .rivals import RIVALS, doubt_rivals
 
 PICTURES, PAGE = "pictures", "report.html"     # folder and file inside the set
 WIDTH, HEIGHT = 150, 216    # pixels of one picture: five side by side fit on the page, of a standing person
-MOST_CARRIED = 4_000_000    # bytes of pictures inside the page, worst scans first; the rest stay files beside it
 FAR = 0.005                 # share of the template's size at the dark end of the distance colours, 7 mm on a person
 TURN = 20.0                 # degrees from the front: shows depth, and the face
 
@@ -64,16 +63,15 @@ def write_set_page(folder: str | Path, limits: Limits | None = None, to: Path | 
     page.section("Worst first", "Green is fine, amber needs a look, red could not be registered.\n\n"
                  + _explanation(limits, size))
     page.picture(color_bar(0, FAR * size, "distance to the scan; grey: no data there"))
-    # pictures and scenes of the worst scans are carried by the page, as far as its size allows
+    # scenes of the worst scans are carried by the page, as far as its size allows
     shots = [folder / pictures_place(entries.get(verdict.name)) / verdict.name for verdict in verdicts]
     scenes = worst_that_turn([shot.with_name(f"{shot.name}.scene") for shot in shots])
-    pictures = embed_files((shot.with_name(f"{shot.name}.webp") for shot in shots), MOST_CARRIED)
     # every scan that needs a look can be turned, and at least six
     look = max(6, sum(verdict.suspect or verdict.failed for verdict in verdicts))
-    for number, (verdict, scene, picture) in enumerate(zip(verdicts, scenes, pictures, strict=True)):
+    for number, (verdict, scene) in enumerate(zip(verdicts, scenes, strict=True)):
         entry = entries.get(verdict.name)
-        view = _scan_view(page, folder, pictures_place(entry), verdict.name, picture, scene if number < look else None)
-        rival = _scan_view(page, folder, pictures_place(entry).with_name(RIVALS), verdict.name, None, None)
+        view = _scan_view(page, folder, pictures_place(entry), verdict.name, scene if number < look else None)
+        rival = _scan_view(page, folder, pictures_place(entry).with_name(RIVALS), verdict.name, None)
         page.markup(_card(verdict, entry, view, rival))
     if registered.skeleton is not None:
         page.section("Skeleton", f"{len(registered.skeleton.parents)} parts: {', '.join(registered.skeleton.names)}.")
@@ -181,13 +179,14 @@ def _card(verdict: Verdict, entry: SetEntry | None, shown: str, rival: str) -> s
             + (f"<div><h4>the other body that explains the scan</h4>{rival}</div>" if rival else "") + "</section>")
 
 
-def _scan_view(page: Page, folder: Path, place: Path, name: str, picture: bytes | None, scene: bytes | None) -> str:
-    """Return HTML of a scan that turns, or of its picture, which is inside the page or a file beside it."""
-    if picture is not None and scene is not None:
-        return page.turning(scene, picture, height=300)
-    if picture is None and not (folder / place / f"{name}.webp").exists():
+def _scan_view(page: Page, folder: Path, place: Path, name: str, scene: bytes | None) -> str:
+    """Return HTML of a scan that turns, or of its picture, a file beside the page."""
+    picture = folder / place / f"{name}.webp"
+    if not picture.exists():
         return ""
-    source = data_uri(picture) if picture is not None else quote((place / f"{name}.webp").as_posix())
+    if scene is not None:
+        return page.turning(scene, picture.read_bytes(), height=300)
+    source = quote((place / f"{name}.webp").as_posix())
     labels = "".join(f"<span>{escape(label)}</span>" for label in PANELS)
     return (f'<div><img src="{source}" alt="{escape(name)}: {", ".join(PANELS)}" '
             f'width="{WIDTH * len(PANELS)}" height="{HEIGHT}" loading="lazy" decoding="async">'
