@@ -1,6 +1,7 @@
 """Pictures and charts of a body in motion."""
 from __future__ import annotations
 
+import functools
 import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -14,8 +15,9 @@ from scanprep.geometry import rotations
 from scanprep.geometry.farthest_points import spread_indices
 from scanprep.geometry.mesh import Mesh
 from scanprep.pictures.camera import Camera, look_around, stance
-from scanprep.pictures.scene import Pane
-from scanprep.pictures.shading import Dots, Moving, Solid, contact_sheet, render
+from scanprep.pictures.page import Page
+from scanprep.pictures.scene import Pane, match_camera_scales, picture_pane
+from scanprep.pictures.shading import Dots, Moving, Solid, contact_sheet
 
 from .motion import Motion
 
@@ -62,6 +64,7 @@ class LightMesh:
     faces: np.ndarray
 
     @staticmethod
+    @functools.lru_cache(maxsize=2)          # the same for all motions of a person
     def of(template: Mesh) -> LightMesh:
         """Simplify a template; one with few triangles is kept."""
         light = 7000  # triangles that suffice for small pictures and motions
@@ -85,8 +88,7 @@ def frames_to_play(motion: Motion) -> tuple[np.ndarray, float]:
 
 
 def moving_pane(motion: Motion, subject: Subject, dots: Sequence[tuple[Dots, np.ndarray]] = (),
-                bodies: Bodies | None = None, light: LightMesh | None = None, color: Sequence[float] | None = None
-                ) -> Pane:
+                bodies: Bodies | None = None, color: Sequence[float] | None = None) -> Pane:
     """Make a pane of a body in motion, with dots; the body stays in the middle of the picture.
 
     Parameters
@@ -99,8 +101,6 @@ def moving_pane(motion: Motion, subject: Subject, dots: Sequence[tuple[Dots, np.
         Dots, and their places in the frames of `frames_to_play`.
     bodies : callable, optional
         Returns vertices (n, N, 3), metres, of frames (n,), if not those of the subject.
-    light : LightMesh, optional
-        The simplified mesh, if it is known already.
     color : (3,) float, optional
         Colour of the body.
 
@@ -109,7 +109,7 @@ def moving_pane(motion: Motion, subject: Subject, dots: Sequence[tuple[Dots, np.
     Pane
     """
     frames, rate = frames_to_play(motion)
-    light = light or LightMesh.of(subject.template)
+    light = LightMesh.of(subject.template)
     make = bodies or (lambda chosen: motion.vertices(subject, chosen))
     # 128 full bodies in memory at a time
     shown = np.concatenate([make(frames[i:i + 128])[:, light.vertex_ids].astype(np.float32)
@@ -137,14 +137,13 @@ def pane_with_dots(motion: Motion, subject: Subject, places: np.ndarray, name: s
     return moving_pane(motion, subject, [(Dots(at[0], MARKER, 0.013, on_top, name=name, labels=labels), at)])
 
 
-def frame_panes(motion: Motion, subject: Subject, markers: np.ndarray | None, frames: np.ndarray, turn: float = TURN
+def frame_panes(motion: Motion, subject: Subject, markers: np.ndarray, frames: np.ndarray, turn: float = TURN
                 ) -> list[Pane]:
     """Make a pane for each of some frames, with measured markers (T, L, 3), metres, as dots."""
     panes, light, vertical = [], LightMesh.of(subject.template), upwards(motion, subject)
     for t, vertices, time in zip(frames, motion.vertices(subject, frames), seconds(motion, frames), strict=True):
-        dots = [] if markers is None else [Dots(markers[t], MARKER, radius=0.013)]
         camera = facing(subject, motion.poses[t], vertices, turn, vertical)
-        panes.append(Pane([light.mesh(vertices), *dots], camera, time))
+        panes.append(Pane([light.mesh(vertices), Dots(markers[t], MARKER, radius=0.013)], camera, time))
     return panes
 
 
@@ -156,17 +155,10 @@ def seconds(motion: Motion, frames: np.ndarray) -> list[str]:
 def bodies_in_a_row(subject: Subject, poses: np.ndarray, bodies: np.ndarray, colors: np.ndarray | None = None,
                     height: int = 360) -> list[np.ndarray]:
     """Render bodies (n, N, 3) in poses (n, J, 3) at one scale; `colors` (n, N, 3) are of their vertices."""
-    size, images = 1.06 * np.ptp(bodies, axis=1).max(axis=0) / 2, []
     vertical = stance(subject.template, rotations.exp(poses[:, 0]))[0]
-    up, sign = int(np.abs(vertical).argmax()), vertical.sum()
-    floor = sign * (sign * bodies[..., up]).min()
-    for i, body in enumerate(bodies):
-        middle = (body.min(axis=0) + body.max(axis=0)) / 2
-        middle[up] = floor + sign * size[up] / 1.06                        # all stand on one line
-        camera = facing(subject, poses[i], np.stack([middle - size, middle + size]), vertical=vertical)
-        images.append(render(Solid(subject.template.with_vertices(body), None if colors is None else colors[i]), camera,
-                             int(0.62 * height), height))
-    return images
+    panes = [Pane([Solid(subject.template.with_vertices(body), None if colors is None else colors[i])],
+                  facing(subject, poses[i], body, vertical=vertical)) for i, body in enumerate(bodies)]
+    return [picture_pane(pane, int(0.62 * height), height) for pane in match_camera_scales(panes)]
 
 
 def picture_bodies(motion: Motion, subject: Subject, bodies: np.ndarray, frames: np.ndarray) -> np.ndarray:
@@ -183,23 +175,26 @@ def mean_over(values: np.ndarray, axis: int) -> np.ndarray:
         return np.nanmean(values, axis=axis)
 
 
-def marker_rows(labels: Sequence[str], residuals: np.ndarray, soft: np.ndarray | None, trusted: np.ndarray | None
-                ) -> list[tuple[Any, ...]]:
-    """Make a table of markers, the worst first: label, mean distances (mm), 95th percentile, seen and trusted (%).
+def show_markers(page: Page, motion: Motion, soft: Motion | None = None) -> None:
+    """Add a table of the markers, the worst first, and the names of those that were never used.
 
-    Distances (T, L) are from the body of fixed shape, and if given from the `soft` one, to which the percentile refers.
-    Markers that were never seen are left out, unless `trusted` is None.
+    Distances are from the body of fixed shape, and if given from the one with `soft` tissue, to which the 95th
+    percentile refers.
     """
-    out = []
-    for i, label in enumerate(labels):
-        seen = np.isfinite(residuals[:, i])
-        if seen.any() or trusted is None:
-            shown = 1000 * (residuals if soft is None else soft)[seen, i]
-            out.append((label, 1000 * float(mean_over(residuals[:, i], 0)),
-                        np.nan if soft is None else 1000 * float(mean_over(soft[:, i], 0)),
-                        float(np.nanpercentile(shown, 95)) if len(shown) else np.nan, 100 * float(seen.mean()),
-                        np.nan if trusted is None else 100 * float(trusted[seen, i].mean())))
-    return sorted(out, key=lambda row: -row[1])
+    motions = {"mean distance (mm)": motion} if soft is None else {"fixed shape (mm)": motion, "soft tissue (mm)": soft}
+    shown, rows, unused = motion if soft is None else soft, [], []
+    for i, label in enumerate(motion.labels):
+        seen = np.isfinite(motion.residuals[:, i])
+        if not seen.any():
+            unused.append(label)
+            continue
+        rows.append((label, *(1000 * float(mean_over(each.residuals[:, i], 0)) for each in motions.values()),
+                     float(np.nanpercentile(1000 * shown.residuals[seen, i], 95)), 100 * float(seen.mean()),
+                     100 * float(motion.trusted[seen, i].mean())))
+    page.table(sorted(rows, key=lambda row: -row[1]),
+               ("marker", *motions, "95th percentile (mm)", "seen (%)", "believed (%)"))
+    if unused:
+        page.text(f"Not used, because the layout does not know them or they were never seen: {', '.join(unused)}.")
 
 
 def chart(width: float, height: float) -> tuple[Any, Any]:
@@ -210,42 +205,14 @@ def chart(width: float, height: float) -> tuple[Any, Any]:
     return figure, figure.add_subplot()
 
 
-def chart_residuals(motion: Motion, what: str = "markers", lost: bool = False) -> Any:
-    """Draw the distance of the markers from the body over time; with `lost`, lost frames are shaded."""
+def chart_residuals(motion: Motion, what: str = "markers") -> Any:
+    """Draw the distance of the markers from the body over time."""
     figure, axes = chart(7.5, 2.6)
     shown = np.isfinite(motion.residuals).any(axis=1)
     millimetres = 1000 * motion.residuals[shown]
     axes.fill_between(motion.times[shown], *np.nanpercentile(millimetres, [10, 90], axis=1), alpha=0.25,
                       label="10th to 90th percentile", linewidth=0)
     axes.plot(motion.times[shown], np.nanmean(millimetres, axis=1), linewidth=1.2, label="mean")
-    # begin and end of every run of lost frames
-    edges = np.flatnonzero(np.diff(np.r_[True, motion.converged, True])) if lost else np.zeros(0, dtype=int)
-    for i, span in enumerate((edges.reshape(-1, 2) - 0.5) / motion.rate):
-        axes.axvspan(*span, color="0.85", label="lost" if i == 0 else None)
     axes.set(xlabel="time (s)", ylabel=f"distance of the {what} (mm)", ylim=(0, None))
     axes.legend(frameon=False)
-    return figure
-
-
-def chart_states(state: np.ndarray, labels: Sequence[str], rate: float, colors: Sequence[str],
-                 names: Sequence[str] = ()) -> Any:
-    """Draw the state (T, L) int of every marker over time; where frames share a pixel, the highest.
-
-    Each state has a colour; the legend shows the names of those that occur.
-    """
-    from matplotlib.colors import ListedColormap
-    from matplotlib.patches import Patch
-
-    # 600 columns are as many as the chart has pixels
-    steps = np.array_split(np.arange(len(state)), min(len(state), 600))
-    shown = np.array([state[part].max(axis=0) for part in steps])
-    figure, axes = chart(7.5, 0.6 + 0.13 * len(labels))
-    axes.imshow(shown.T, aspect="auto", interpolation="nearest", vmin=0, vmax=len(colors) - 1,
-                cmap=ListedColormap(list(colors)), extent=(0, len(state) / rate, len(labels) - 0.5, -0.5))
-    axes.set_yticks(range(len(labels)), labels, fontsize=6)
-    axes.set_xlabel("time (s)")
-    if names:
-        patches = [Patch(color=colors[i], label=names[i]) for i in np.unique(state)]
-        axes.legend(handles=patches, frameon=False, fontsize=8, ncols=len(names), loc="upper center",
-                    bbox_to_anchor=(0.5, -0.52 / figure.get_figheight()))
     return figure

@@ -29,9 +29,8 @@ def parts_panes(template: Mesh, skeleton: Skeleton) -> list[Pane]:
 
 
 def picture_parts(template: Mesh, skeleton: Skeleton) -> np.ndarray:
-    """Picture parts and joints from the front, and the parts from the back."""
-    panes, (back,) = parts_panes(template, skeleton), look_around(template, turns=(195,))
-    return picture_panes([*panes, replace(panes[0], camera=back, label="back")], 640)
+    """Picture parts and joints from the front."""
+    return picture_panes(parts_panes(template, skeleton), 640)
 
 
 def component_panes(model: BodyModel) -> list[Pane]:

@@ -11,7 +11,7 @@ from completion_bodies import MEAN, worm_with_prior
 from config_files import config_file
 from quiet_pictures import render
 
-from completion import MarkerLayout, MarkerSequence, motion_pictures, write_markers
+from completion import MarkerLayout, MarkerSequence, write_markers
 from completion.__main__ import main
 from completion.mocap.mosh import cli, report
 from completion.mocap.mosh.work import MoshTask
@@ -62,8 +62,7 @@ def run(place, *words, **settings):
 def small_pictures():
     """Nobody looks at them here."""
     with pytest.MonkeyPatch.context() as patch:
-        for module in (scene, motion_pictures):
-            patch.setattr(module, "render", render)
+        patch.setattr(scene, "render", render)
         yield
 
 
@@ -72,8 +71,7 @@ class QuietWork(MoshTask):
 
     def __call__(self, actor, room):
         with small_pictures(), pytest.MonkeyPatch.context() as patch:
-            for chart in ("chart_frames", "chart_timeline"):
-                patch.setattr(report, chart, lambda take: None)
+            patch.setattr(report, "chart_residuals", lambda motion: None)
             patch.setattr(Page, "chart", lambda page, *_rest: page)
             return super().__call__(actor, room)
 

@@ -124,7 +124,7 @@ def test_a_folder_of_people_goes_on_where_it_was(place, tmp_path, capsys):
     (people / "ann" / "run.csv").unlink()
     assert run(place, people, "-o", out, soft_tissue=False) == 0
     said = capsys.readouterr().err
-    assert "ann: walk.csv" in said and "which also mends markers" in said.split("next: ")[1]
+    assert "ann: walk.csv" in said and "scape view --mend" in said.split("next: ")[1]
     assert (told(out)["people"], told(out)["done before"], told(out)["failed"]) == (2, 0, 0)
     assert not (out / "ann" / "walk" / "soft_tissue.npz").exists()
     when = (out / "ann" / "walk" / "motion.npz").stat().st_mtime_ns

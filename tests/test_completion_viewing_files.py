@@ -1,6 +1,5 @@
 """`scape view`: what files are, what cannot be shown, the same in a notebook."""
 import json
-import warnings
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,7 +11,7 @@ from people_bodies import small_people
 from readme_user import of_a_user
 from viewing_apps import a_motion, app_of, ask, write_files
 
-from completion import MarkerSequence, Motion, write_markers
+from completion import MarkerSequence, write_markers
 from completion.__main__ import main
 from completion.partial.completion import Completion
 from completion.viewing import files as reading
@@ -20,10 +19,8 @@ from completion.viewing.arrangement import arrange_side_by_side
 from completion.viewing.contents import of_mesh
 from completion.viewing.notebook import view
 from model import files as files_of_models
-from model import load_model
 from scanprep import RegisteredSet, write_mesh
 from scanprep.geometry import rotations
-from scanprep.geometry.mesh import Mesh
 from scanprep.synthetic.people import MARKERS, SyntheticPerson, synthesise_walk
 
 
@@ -83,15 +80,6 @@ def test_a_registered_set_is_a_list_with_the_first_shown(model, tmp_path):
     assert [message.kind for message in told] == ["scene", "state"] and app.shown == [1, 2]
 
 
-def test_more_than_twelve_files_are_a_list(model, tmp_path):
-    for i in range(14):
-        write_mesh(tmp_path / f"m{i:02}.ply", model.template)
-    app = app_of(tmp_path, ".")
-    assert len(app.entries) == 14 and app.shown == [0]
-    with pytest.raises(ValueError, match="at most 12"):
-        ask(app, "show", entries=list(range(14)))
-
-
 def test_a_completion_has_its_errors_as_heat(model, tmp_path):
     mesh, N = model.template, len(model.template.vertices)
     done = Completion(mesh, mesh, np.zeros((4, 3)), np.zeros(3), np.zeros(3), np.arange(N) < 50, rms=0.0, explained=1.0,
@@ -132,15 +120,6 @@ def test_a_bad_file_among_good_ones_is_told_of(files, tmp_path):
     assert "bad.ply" in app.state().fields["problems"][0]
 
 
-def test_a_scan_in_millimetres_is_noted(tmp_path, model):
-    write_mesh(tmp_path / "mm.ply", Mesh(1000 * model.template.vertices, model.template.faces))
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always")
-        app = app_of(tmp_path, "mm.ply")
-    assert "unit='mm'" in app.state().fields["notes"][0] and "unit='mm'" in str(caught[0].message)
-    assert not app_of(tmp_path, "mm.ply", unit="mm").state().fields["notes"]
-
-
 @pytest.mark.slow
 def test_a_notebook_shows_what_turns_without_a_network(model, new_page, tmp_path):
     subject, motion = model.subject(np.array([0.5, -1.0])), a_motion(20)
@@ -178,20 +157,6 @@ def test_things_at_one_place_are_seen_from_one_side(model):
     cameras, _ = arrange_side_by_side([body, standing(40), standing(170), standing(40, 5.0)])
     apart = [np.degrees(np.arccos(np.clip(one.axes[2] @ cameras[0].axes[2], -1, 1))) for one in cameras]
     assert apart[1] < 1e-3 and apart[2] > 100 and 30 < apart[3] < 50
-
-
-@pytest.mark.parametrize("name", ["people", "people-fingers"])
-def test_results_of_built_in_models_open(name, tmp_path, monkeypatch):
-    """The report of a command without -m names its model; so does -m, wherever one is."""
-    monkeypatch.chdir(tmp_path)
-    parts = len(load_model(name).skeleton.parents)
-    (tmp_path / "out").mkdir()
-    Motion(np.zeros((3, parts, 3)), np.zeros((3, 3)), np.zeros(2), 30.0, np.zeros((3, 0)), ()).save(
-        tmp_path / "out" / "motion.npz")
-    (tmp_path / "out" / "report.json").write_text(json.dumps({"settings": {"model": name}}))
-    assert app_of(tmp_path, "out").shown == [0]
-    (tmp_path / "out" / "report.json").unlink()
-    assert app_of(tmp_path, "out", model=Path(name)).shown == [0]
 
 
 @pytest.mark.slow

@@ -3,7 +3,6 @@ import numpy as np
 import pytest
 from browser import opened, wait_until
 from completion_bodies import worm_with_prior
-from model_bodies import worm_model
 from viewing_apps import OPEN, PART, app_of, ask, expected, seen, write_files
 
 from completion.motion import Motion
@@ -37,12 +36,6 @@ def test_a_movable_body_is_the_model(model):
             betas = rng.normal(size=3)
         y = body.vertices(betas, pose) + body.origin
         assert np.abs(y - model.vertices(pose, betas)).max() < 3e-6
-
-
-def test_a_model_without_betas_is_its_own_body(model):
-    alone = worm_model(components=0)
-    body = MovableBody(alone)
-    assert np.abs(body.vertices(None, np.zeros((4, 3))) + body.origin - alone.template.vertices).max() < 1e-5
 
 
 def test_what_is_saved_is_never_written_over(files, tmp_path, model):
@@ -116,17 +109,6 @@ def test_two_models_share_their_sliders(files, new_page, model):
         wait_until(page, "program.figure.panes.length === 1 && program.sliders?.length === 1")
         page.wait_for_timeout(200)
         assert np.abs(seen(page) - expected(app, short)).max() < 1e-5
-
-
-def test_the_page_fits_a_telephone(files, new_page):
-    app = app_of(files, "worm.npz", "body.ply")
-    with opened(new_page, app, OPEN, width=420, color_scheme="dark") as page:
-        wait_until(page, "program.sliders?.length === 3")
-        assert page.evaluate("document.documentElement.scrollWidth") <= 420
-        assert page.evaluate("program.figure.panes.every((pane) => pane.canvas.clientHeight > 150)")
-        bodies, panel = (page.evaluate(f"document.querySelector('{one}').getBoundingClientRect().top")
-                         for one in (".sk-view", ".sk-panel"))
-        assert bodies < panel
 
 
 @pytest.mark.slow

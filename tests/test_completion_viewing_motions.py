@@ -9,7 +9,6 @@ from viewing_apps import OPEN, a_motion, app_of, seen, write_files
 from completion.mocap.files.markers import MarkerSequence, write_markers
 from completion.motion import Motion
 from completion.viewing.files import Files
-from completion.viewing.motions import as_columns
 
 
 @pytest.fixture(scope="module")
@@ -20,13 +19,6 @@ def model():
 @pytest.fixture(scope="module")
 def files(tmp_path_factory, model):
     return write_files(tmp_path_factory.mktemp("view"), model)
-
-
-def test_a_motion_as_columns(model):
-    motion, subject = a_motion(300), model.subject(np.array([0.5, -1.0]))
-    basis, coefficients = as_columns(motion, subject, motion.vertices(subject, np.arange(0, 300, 7)))
-    assert basis.shape[1] < 60
-    assert np.abs(np.einsum("nr,trc->tnc", basis, coefficients) - motion.vertices(subject)).max() < 2e-3
 
 
 def test_a_motion_wants_its_model(files, tmp_path):

@@ -59,7 +59,7 @@ def folder(tmp_path_factory, template):
 
 def test_worst_first(folder):
     page = (folder / "report.html").read_text()
-    assert re.findall(r'<section class="scan (\w+)" id="scan-(\w+)">', page)[:2] == [
+    assert re.findall(r'<section class="scan (\w+)"><h3><span class="dot"></span>(\w+) ', page)[:2] == [
         ("failed", "body4"), ("look", "body3")]
     order = [float(number) for number in re.findall(r"<small>([\d.]+)</small>", page)]
     assert len(order) == 4 and order == sorted(order, reverse=True)
@@ -68,8 +68,6 @@ def test_worst_first(folder):
 
 def test_everything_is_in_the_page(folder):
     page = (folder / "report.html").read_text()
-    links = set(re.findall(r'href="#(scan-\w+)"', page))
-    assert links == {f"scan-body{k}" for k in range(5)} == set(re.findall(r'id="(scan-\w+)"', page))
     sources = re.findall(r'(?:src|href)="([^"]+)"', page)
     assert all(s.startswith(("data:image/", "#")) for s in sources)
     assert sum(s.startswith("data:image/webp") for s in sources) == 4
@@ -79,17 +77,7 @@ def test_everything_is_in_the_page(folder):
     assert [pane["label"] for pane in first] == ["scan", "the template on it"]
     assert first[0]["camera"] == first[1]["camera"]
     registered = turning[0].layer("registered template")
-    assert [shade["name"] for shade in registered["shades"]] == ["distance to the scan", "confidence", "plain"]
-
-
-def test_a_long_page_leaves_pictures_in_the_folder(folder, monkeypatch):
-    """Those of the worst scans are in it, the others come when they are scrolled to."""
-    worst = (folder / "pictures" / "body3.webp").stat().st_size
-    monkeypatch.setattr(pictures, "MOST_CARRIED", worst + 10)
-    page = write_set_page(folder, to=folder.parent).read_text()
-    linked = re.findall(r'<img src="(pictures/[^"]+)"[^>]* loading="lazy"', page)
-    assert len(linked) == 3 and "pictures/body3.webp" not in linked and "data:image/webp" in page
-    assert all((folder / path).is_file() for path in linked)
+    assert [shade["name"] for shade in registered["shades"]] == ["distance to the scan", "not sure", "plain"]
 
 
 def test_pictures_show_what_they_say(folder):
@@ -116,11 +104,6 @@ def test_names_cannot_break_the_page(folder, tmp_path):
     write_failures(tmp_path / "set", {"d": "<i>broken</i>"})
     page = write_set_page(tmp_path / "set").read_text()
     assert "<script" not in page and "<i>" not in page and "a b&amp;c" in page
-
-
-def test_set_without_scans(tmp_path):
-    RegisteredSet.create(tmp_path / "set", ball(0))
-    assert "0 scans" in write_set_page(tmp_path / "set").read_text()
 
 
 @pytest.mark.parametrize("change, reason", [
@@ -198,7 +181,7 @@ def test_missed_points(template):
     second = template.corners.reshape(-1, 3) + [3, 0, 0]
     faces = np.concatenate([template.faces, len(template.vertices) + np.arange(len(second)).reshape(-1, 3)])
     both = Mesh(np.concatenate([template.vertices, second]), faces)
-    assert share_uncovered(both, template, 0.01, samples=len(both.vertices)) == pytest.approx(0.5, abs=1e-6)
+    assert share_uncovered(both, template, 0.01) == pytest.approx(0.5, abs=0.01)
 
 
 def test_tables_keep_their_numbers(tmp_path):

@@ -9,8 +9,7 @@ from scan_folders import MARKS, QUICK, ball, contents, write_scans
 
 from scanprep import RegisteredSet, read_mesh, write_landmarks, write_mesh
 from scanprep.batch.calls import RUN
-from scanprep.batch.opening import lock_output, workspace
-from scanprep.batch.ownership import HOME
+from scanprep.batch.opening import workspace
 from scanprep.geometry.landmark_names import TEN
 from scanprep.geometry.landmarks import read_landmarks
 from scanprep.geometry.storage import StorageError
@@ -143,20 +142,6 @@ def test_where_nobody_named_a_landmark_those_of_people_are_offered(place):
     app = allowed(MendApp(place / "set", ENDING))
     assert app.names == TEN and app.building and app.chosen == TEN[0]
     assert pick.PickApp(Clicked.load(place / "set" / "template.ply", ENDING), [], TEN).names == TEN
-
-
-def test_another_run_on_the_set_is_told_and_nothing_is_lost(place):
-    app = allowed(MendApp(place / "set", ENDING))
-    mend(app, place)
-    before = contents(place / "set")
-    with lock_output(place / "set" / HOME / "lock", place / "set"):
-        sent(app, "register")
-        wait(app)
-    assert "another run is at work" in app.note and app.greet()[-1].fields["changed"] == ["body1"]
-    assert contents(place / "set") == before
-    sent(app, "register")
-    wait(app)
-    assert app.greet()[-1].fields["verdicts"][0]["verdict"] == "good"
 
 
 def test_new_landmark_files_lie_where_the_run_reads_them(place):

@@ -75,15 +75,6 @@ def test_the_interval_is_the_first_that_a_joint_has_room_in(layers, ends):
         np.testing.assert_allclose(found, [[0.1, 0.2, end] for end in ends], atol=1e-5)
 
 
-def test_a_ray_that_misses_or_never_leaves_has_no_interval():
-    mesh = boxes((0, 0.5))
-    upper = Mesh(mesh.vertices, mesh.faces[mesh.corners[..., 2].min(axis=1) > 0.4])
-    assert Clickable(mesh).interval(np.array([5.0, 0, 5]), np.array([0, 0, -1.0])) is None
-    assert Clickable(upper).interval(np.array([0.1, 0.2, 5.0]), np.array([0, 0, -1.0])) is None
-    with pytest.raises(ValueError, match="no inside"):
-        JointApp(Clicked("cloud.ply", "x.json", surface=Clickable(mesh.vertices)), HUMANOID, FACE)
-
-
 def test_joints_clicked_from_the_front_are_within_15_mm_and_so_are_their_mirrors(app, true_joints):
     for name, place in true_joints.items():
         if name.startswith("l_"):
@@ -115,16 +106,6 @@ def test_points_of_the_face_are_on_the_surface_and_the_other_side_is_offered_nex
     assert np.linalg.norm(app.template.places["left eye"] - place) < 0.003 and app.depth is None
     assert app.chosen == "right eye" and "“right eye”: on the surface" in app.more()["hint"]
     assert np.linalg.norm(app.template.predicted["right eye"] - person.mesh.vertices[landmarks()["right eye"]]) < 0.01
-
-
-def test_the_depth_stays_while_a_joint_slides_and_goes_with_the_next_act(app, true_joints):
-    click(app, "l_hip", true_joints["l_hip"])
-    before = app.template.places["l_hip"]
-    app.handle(Message("slide", {"pane": 0, "name": "l_hip", "direction": [0, 1, 0], "by": 0.01}), lambda message: None)
-    assert app.depth["name"] == "l_hip"
-    np.testing.assert_allclose(app.template.places["l_hip"] - before, [0, 0.01, 0])
-    app.handle(Message("undo", {}), lambda message: None)
-    assert app.depth is None
 
 
 def test_the_command_starts_with_what_was_found_and_goes_on_where_it_ended(person, tmp_path, monkeypatch):

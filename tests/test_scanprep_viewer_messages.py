@@ -1,7 +1,6 @@
 """Messages between page and program: no click is lost or done twice, and newer answers replace older ones."""
 import math
 import struct
-import threading
 
 import numpy as np
 import pytest
@@ -57,19 +56,6 @@ def test_a_page_is_greeted_and_told_what_changes(server):
     assert page.receive("state").fields == {"clicks": 1, "n": 5}
 
 
-def test_a_second_page_takes_the_place_of_the_first(server, app):
-    first = opened(server)
-    answers = []
-    waiting = threading.Thread(target=lambda: answers.append(first.next()))
-    waiting.start()
-    second = opened(server, "second-page")
-    waiting.join(5)
-    assert answers == [409] and first.next() == 409 and first.send("click", 1, n=1) == 409
-    assert second.send("click", 1, n=2) == 200 and app.seen == [2]
-    again = opened(server)                                  # it was loaded again
-    assert again.send("click", 1, n=3) == 200 and second.next() == 409
-
-
 def test_a_page_loads_while_a_job_runs(server, app):
     first = opened(server)
     first.send_aside("work", 1)
@@ -85,29 +71,6 @@ def test_a_page_that_reads_slowly_gets_the_newest_of_each_kind(server):
         server.send(Message("positions", {"n": n}, bytes(2**20), latest=f"positions {n % 2}"))
         server.send(Message("state", {"n": n}))
     assert [page.next().fields["n"] for _ in range(3)] == [498, 499, 499]
-
-
-def test_what_was_taken_in_is_not_handled_again_after_a_lost_connection(server, app):
-    page = opened(server)
-    page.send("click", 1, n="a")
-    page.send("click", 2, n="b")
-    again = Page(server, turn=1)
-    assert again.receive("state").fields == {"clicks": 2}
-    again.send("click", 2, n="b")
-    again.send("click", 3, n="c")
-    assert app.seen == ["a", "b", "c"] and page.next() == 409
-    opened(server, "another-page").send("click", 1, n="d")
-    assert app.seen == ["a", "b", "c", "d"]
-
-
-def test_an_answer_that_the_lost_connection_waits_for_goes_to_the_new_one(server):
-    page = opened(server)
-    waiting = threading.Thread(target=page.next)
-    waiting.start()
-    again = opened(server, turn=1)
-    server.send(Message("news"))
-    waiting.join(5)
-    assert again.receive("news")
 
 
 @pytest.mark.parametrize("data", [b"\x00", b"hello"])

@@ -12,7 +12,6 @@ from scanprep.geometry.files import write_mesh
 from scanprep.geometry.landmarks import read_landmarks, write_landmarks
 from scanprep.geometry.mesh import Mesh
 from scanprep.pictures.shading import sphere
-from scanprep.pipeline.pick import pick_landmarks
 from scanprep.synthetic.landmarks import landmarks
 from scanprep.synthetic.people import SyntheticPerson
 from scanprep.viewer.clicked import Clicked, camera_like, camera_of, predict_landmarks
@@ -159,17 +158,6 @@ def test_a_unit_that_was_told_is_that_of_the_file(folder, person, ending, unit):
     np.testing.assert_allclose(read_landmarks(ben.file, None, unit)["top of head"][2], place[2], atol=1e-3)
 
 
-def test_the_unit_is_that_of_the_scans_and_of_a_mesh_alone(folder, person, monkeypatch):
-    """The template of scans is in metres, as `scape prep run` reads it."""
-    shown = []
-    monkeypatch.setattr("scanprep.viewer.server.serve", lambda app, *_given: shown.append(app))
-    write_mesh(folder / "ben.ply", person.mesh.with_vertices(1000 * person.mesh.vertices))
-    pick_landmarks(folder / "template.ply", (folder / "ben.ply",), unit="mm")
-    pick_landmarks(folder / "ben.ply", unit="mm")
-    tall = [np.ptp(one.body.points[:, 2]) for app in shown for one in (app.template, *app.scans)]
-    np.testing.assert_allclose(tall, [np.ptp(person.mesh.vertices[:, 2])] * 3, rtol=1e-6)
-
-
 def test_work_that_fails_does_not_leave_the_page_waiting(folder, capsys):
     app, told = app_of(folder), []
 
@@ -244,17 +232,6 @@ def test_one_crossed_pair_is_exchanged_by_itself(folder):
     assert app.scans[0].places == places
 
 
-def test_undo_gives_the_file_back_as_it_was(folder):
-    """So that a scan is not registered again for a click that was taken back."""
-    path = folder / "anna.landmarks.json"
-    write_landmarks(path, {name: np.ones(3) * i for i, name in enumerate(FOUR)})
-    before, app = path.read_bytes(), app_of(folder)
-    sent(app, "remove", pane=1, name=FOUR[1])
-    assert path.read_bytes() != before
-    sent(app, "undo")
-    assert path.read_bytes() == before
-
-
 def test_landmarks_are_predicted_only_where_some_are_missing(folder):
     app = app_of(folder)
     known = read_landmarks(folder / "template.landmarks.json", app.template.body.shape)
@@ -311,51 +288,6 @@ def test_landmarks_are_picked_by_mouse_and_saved(new_page, folder, person):
         page.locator("button", has_text="redo").click()
         wait_until(page, "Object.keys(program.state.panes[1].places).length === 4")
     assert set(read_landmarks(folder / "anna.landmarks.json")) == set(FOUR)
-
-
-@pytest.mark.slow
-def test_the_page_helps_a_hand(new_page, folder, person):
-    """Views, clicks just beside the body, landmarks behind it, and those that are not where they are predicted."""
-    app = app_of(folder)
-    app._predict_if_time = lambda send, pane: None
-    vertex = landmarks()["navel"]
-    place = moved(person.mesh.vertices[vertex])
-    click(app, place, "navel", normal=moved(person.mesh.vertices[vertex] + person.mesh.vertex_normals[vertex]) - place)
-    app.scans[0].predicted, app.chosen = {"navel": app.scans[0].places["navel"] + [0, 0, 0.1]}, "navel"
-    with opened(new_page, app) as page:
-        side, away = page.get_by_label("side", exact=True), "program.figure.panes[1].camera.position.length()"
-        x, y = on_page(page, app.scans[0].places["navel"])
-        before = page.evaluate(away)
-        page.mouse.move(x, y + 60)
-        page.mouse.wheel(0, 300)                                      # nothing was clicked before
-        wait_until(page, f"Math.abs({away} - {before}) > 0.05 && {json.dumps('turned')} === program.figure.side.value")
-        side.select_option("first view")
-        wait_until(page, f"Math.abs({away} - {before}) < 1e-6")
-        near = f"program.near(program.figure.panes[1], 1, {{clientX: {x}, clientY: {y}}})"
-        assert page.evaluate(near) == "navel"
-        side.select_option("back")
-        x, y = on_page(page, app.scans[0].places["navel"])
-        near = f"program.near(program.figure.panes[1], 1, {{clientX: {x}, clientY: {y}}})"
-        assert page.evaluate(near) is None                            # the body hides it
-        assert page.evaluate("program.figure.panes[1].home.distance *= 0.5, program.figure.look(90, 0), "
-                             "program.figure.panes[1].reach()") <= 1
-        page.evaluate("program.figure.panes[1].home.distance *= 2")
-        side.select_option("front")
-        page.locator("button", has_text="move it there").click()
-        wait_until(page, "program.off('navel') < 1e-6 && program.buttons.there.hidden")
-        page.keyboard.press("Control+z")
-        wait_until(page, "Math.abs(program.off('navel') - 0.1) < 1e-6 && !program.buttons.there.hidden")
-        page.locator(".sk-names li").filter(has_text="top of head").first.click()
-        wait_until(page, "program.state.chosen === 'top of head'")
-        x, y = on_page(page, moved(person.mesh.vertices[landmarks()["top of head"]]))
-        border = page.evaluate("""([x, y]) => {
-          const hits = (up) => program.figure.panes[1].hit({clientX: x, clientY: y - up});
-          let up = 0;
-          while (hits(up)) up++;
-          return y - up - 4;
-        }""", [x, y])
-        page.mouse.click(x, border)
-        wait_until(page, "'top of head' in program.state.panes[1].places")
 
 
 @pytest.mark.slow
@@ -433,20 +365,18 @@ def test_a_click_far_from_the_prediction_is_questioned(folder, person):
     assert np.linalg.norm(app.scans[0].places["right toe"] - true["right toe"]) > 1
 
 
-@pytest.mark.parametrize("azimuth", [0, 90, 180, 215])
-@pytest.mark.parametrize("known", [False, True])
-def test_the_scan_is_shown_from_the_side_of_the_template(person, azimuth, known):
+@pytest.mark.parametrize("azimuth", [90, 215])
+def test_the_scan_is_shown_from_the_side_of_the_template(person, azimuth):
     """A body that is turned by any angle: both panes show it from the front, also where its outline does not tell."""
     R = rotations.exp(np.radians([0.0, 0.0, azimuth]))
     first = camera_of(person.mesh)
     cut = person.mesh.submesh(person.mesh.corners.mean(axis=1)[:, 2] > 0.25)[0]           # without feet, which tell
     body = cut.with_vertices(cut.vertices @ R.T + 3)
     marks = person.mesh.vertices[[landmarks()[name] for name in FOUR]]
-    found = camera_like(first, person.mesh.vertices, body, (marks, marks @ R.T + 3) if known else None)
-    assert found.axes[2] @ R @ first.axes[2] > np.cos(np.radians(20 if known else 31))
+    assert camera_like(first, body, (marks, marks @ R.T + 3)).axes[2] @ R @ first.axes[2] > np.cos(np.radians(20))
 
 
-@pytest.mark.parametrize("azimuth", [0, 90, 180, 215])
+@pytest.mark.parametrize("azimuth", [0, 215])
 @pytest.mark.parametrize("kind", ["mesh", "cloud", "noisy cloud"])
 def test_a_one_sided_scan_is_seen_from_outside(person, azimuth, kind):
     """Not in a mirror: from where its camera was, and with a template from at most 60 degrees beside it."""
@@ -457,78 +387,7 @@ def test_a_one_sided_scan_is_seen_from_outside(person, azimuth, kind):
     assert camera_of(body).axes[2] @ toward > np.cos(np.radians(30))
     first, marks = camera_of(person.mesh), person.mesh.vertices[[landmarks()[name] for name in FOUR]]
     for known in (None, (marks, marks)):
-        assert camera_like(first, person.mesh.vertices, body, known).axes[2] @ toward > np.cos(np.radians(75))
-
-
-@pytest.mark.slow
-def test_the_next_scan_opens_whole_and_its_long_name_is_read(new_page, folder, person):
-    """Zoomed in on one scan, the next one is seen from head to foot; the template's view stays as it was turned."""
-    name = f"{'a_long_name_of_a_scan_' * 4}.ply"
-    write_mesh(folder / name, person.mesh.with_vertices(1.05 * person.mesh.vertices))
-    reach = "program.figure.panes[{}].reach()"
-    with opened(new_page, app_of(folder, scans=("anna.ply", name))) as page:
-        for pane in (0, 1):
-            page.locator(".sk-canvas").nth(pane).hover()
-            while page.evaluate(reach.format(pane)) < 3:
-                page.mouse.wheel(0, -300)
-                page.wait_for_timeout(30)
-        page.keyboard.press("]")
-        wait_until(page, f"program.state.scan === 1 && {reach.format(1)} <= 1")
-        assert page.evaluate(reach.format(0)) > 2.9
-        label = page.locator(".sk-label").nth(1)
-        assert label.inner_text() == name
-        assert page.get_by_label("scan", exact=True).get_attribute("title") == f"{name}: 0"
-        assert label.evaluate("(e) => e.scrollWidth <= e.clientWidth && e.scrollHeight <= e.clientHeight")
-        boxes = [page.locator(one).nth(1).bounding_box() for one in (".sk-label", ".sk-canvas")]
-        assert boxes[0]["height"] > 30 and boxes[0]["y"] + boxes[0]["height"] <= boxes[1]["y"]
-
-
-@pytest.mark.slow
-def test_the_list_of_names_is_one_stop_of_the_tab_key(new_page, folder, person):
-    """Arrows choose in it; what is set, predicted and missing differs by its shape; one click exchanges a pair."""
-    app = app_of(folder)
-    true = {name: moved(person.mesh.vertices[landmarks()[name]]) for name in FOUR}
-    app.scans[0].places = {**true, FOUR[0]: true[FOUR[1]], FOUR[1]: true[FOUR[0]]}
-    app.scans[0].predicted = {"navel": moved(person.mesh.vertices[landmarks()["navel"]])}
-    with opened(new_page, app) as page:
-        inside, chosen = "Boolean(document.activeElement.closest('.sk-names'))", "program.state.chosen"
-        page.locator(".sk-theme").focus()
-        page.keyboard.press("Tab")
-        assert page.evaluate(inside) and page.evaluate(f"document.activeElement.innerText.includes({chosen})")
-        for key, name in (("Home", FOUR[0]), ("ArrowDown", FOUR[1]), ("ArrowDown", FOUR[2]), ("ArrowUp", FOUR[1])):
-            page.keyboard.press(key)
-            wait_until(page, f"{chosen} === {json.dumps(name)} && document.activeElement.innerText === {chosen}")
-        page.keyboard.press("Tab")
-        assert not page.evaluate(inside)
-        page.locator("button", has_text=f"exchange with {FOUR[0]}").click()
-        wait_until(page, "program.state.undo")
-        assert all(np.array_equal(app.scans[0].places[name], true[name]) for name in FOUR)
-        shape = ("(e) => { const s = getComputedStyle(e);"
-                 "return [s.borderRadius, s.transform, s.backgroundColor.endsWith(' 0)')].join() }")
-        marks = {mark.get_attribute("aria-label"): mark.evaluate(shape) for mark in page.locator(".sk-dots > *").all()}
-        assert set(marks) == {"set", "predicted", "not set"} and len(set(marks.values())) == 3
-        wait_until(page, "program.figure.panes[1].layers.some(({labels}) => labels.includes('navel ?'))")
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("width", [1400, 420])
-def test_the_instruction_stands_above_the_bodies(folder, person, new_page, width):
-    """Also on a telephone, where it was below the fold; and the question about a far click with its buttons."""
-    app = app_of(folder)
-    app.scans[0].predicted = {"left toe": moved(person.mesh.vertices[landmarks()["left toe"]])}
-    with opened(new_page, app, width=width, height=860) as page:
-        above = "(() => { const s = document.querySelector('%s').getBoundingClientRect();" \
-            "const c = document.querySelector('canvas').getBoundingClientRect();" \
-            "return s.height > 0 && s.top >= 0 && s.bottom <= c.top + 1 && c.top < 200 })()"
-        wait_until(page, above % ".sk-status")
-        assert page.locator(".sk-status").inner_text().startswith("Click “")
-        place = moved(person.mesh.vertices[landmarks()["right toe"]]) + [0, 0, 0.2]
-        page.evaluate("(place) => program.send('place', place)", {
-            "pane": 1, "name": "left toe", "origin": place.tolist(), "direction": [0, 0, -1]})
-        wait_until(page, above % ".sk-question")
-        page.locator(".sk-question button").filter(has_text="keep").click()
-        wait_until(page, "program.state.question === null && document.querySelector('.sk-question').hidden")
-        assert "left toe" in app.scans[0].places
+        assert camera_like(first, body, known).axes[2] @ toward > np.cos(np.radians(75))
 
 
 def test_hostile_messages_are_refused_in_a_line(folder, capfd):

@@ -19,7 +19,7 @@ from socket_client import Page, ask
 from scanprep.viewer.gate import one_line
 from scanprep.viewer.messages import Message
 from scanprep.viewer.served_page import page as html
-from scanprep.viewer.server import Server, Stopped
+from scanprep.viewer.server import Server
 
 
 @pytest.mark.parametrize("path", ["/", "/?token=wrong", "/?token=%ff", "/?open=wrong", "/?open=", "/message",
@@ -141,21 +141,6 @@ def test_the_page_holds_a_bundle_whatever_is_in_its_texts():
     shown = html("<b>", 'a"</script>', "x = '</script><!--<script'", "p{}</style>", "s", "n")
     assert shown.count("</script>") == 3 and "<!--" not in shown and shown.count("</style>") == 1
     assert "<title>&lt;b&gt;</title>" in shown and shown.startswith("<!doctype html>")
-
-
-def test_the_server_ends_within_a_second_though_a_job_runs(app):
-    with Server(app) as server:
-        page = Page(server)
-        page.next()
-        page.send_aside("endless", 1)
-        assert app.busy.wait(5)
-        before = time.monotonic()
-        server.__exit__()
-        assert time.monotonic() - before < 1 and app.ended.is_set()
-        with pytest.raises(OSError):
-            ask(server)
-        with pytest.raises(Stopped):
-            server.send(Message("late"))
 
 
 @pytest.mark.slow

@@ -15,8 +15,8 @@ from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.surface import Surface
 from scanprep.pictures.camera import Camera, stance
 from scanprep.pictures.page import Page
-from scanprep.pictures.scene import Pane
-from scanprep.pictures.shading import Dots, Heat, Shape, Solid, contact_sheet, render
+from scanprep.pictures.scene import Pane, picture_panes
+from scanprep.pictures.shading import Dots, Heat, Shape, Solid
 from scanprep.pictures.sheets import webp_bytes
 
 from .completion import Completion
@@ -26,30 +26,14 @@ HEIGHT = 520                         # pixels of the pictures and of the page's 
 ERROR, OFF = "expected error", "distance of the scan to the {} body"
 
 
-def picture_completion(scan: View | Sequence[View], completion: Completion, template: Mesh,
-                       masked: np.ndarray | None = None) -> np.ndarray:
-    """Render the scan and the completed body in two colours, from the side that was seen and from behind.
-
-    `masked` (n,) bool marks clothing and hair.
-    """
-    views = [sides(completion, template)[turn] for turn in (0, 2)]
-    body = completion.completed
-    colors = np.where(completion.seen[:, None], MEASURED, COMPLETED)
-    scan_parts = scan_shapes(scan, masked, completion.scale)
-    shown: list[tuple[Sequence[Shape], Camera, str]] = [
-        (scan_parts, views[0], "scan, from the camera"), (scan_parts, views[1], "scan, from behind"),
-        ([Solid(body, colors)], views[0], "completed"), ([Solid(body, colors)], views[1], "completed, from behind"),
-        ([Solid(completion.predicted)], views[1], "predicted, from behind")]
-    # one size that fits all views, at most twice as wide as high: pictures of long subjects are less high
-    aspect = max(view.width / view.height for view in views)
-    height = max(1, min(HEIGHT, round(2 * HEIGHT / aspect)))
-    width = int(height * aspect) + 10
-    return contact_sheet([render(shape, view, width, height) for shape, view, _ in shown],
-                         [label for _, _, label in shown])
+def picture_completion(panes: Sequence[Pane], completion: Completion, template: Mesh) -> np.ndarray:
+    """Render the panes of `completion_panes`, and the completed body from behind."""
+    behind = view_of(completion, template, -1.0)
+    return picture_panes([*panes, replace(panes[1], camera=behind, label="completed, from behind")], HEIGHT)
 
 
-def sides(completion: Completion, template: Mesh) -> list[Camera]:
-    """Return four cameras around the completed body, a quarter turn apart, the side that was seen first."""
+def view_of(completion: Completion, template: Mesh, way: float = 1.0) -> Camera:
+    """Return a camera before the side of the completed body that was seen; with -1, behind it."""
     body = completion.completed
     vertical, ahead = stance(template, rotations.exp(completion.pose[0]))
     # mean normal of the observed surface, made horizontal
@@ -57,8 +41,7 @@ def sides(completion: Completion, template: Mesh) -> list[Camera]:
     towards -= (towards @ vertical) * vertical
     # a scan from all sides has hardly any mean normal: then the front is first
     side = towards / np.linalg.norm(towards) if np.linalg.norm(towards) > 0.05 * body.vertex_areas.sum() else ahead
-    aside = np.cross(vertical, side)
-    return [Camera.from_side(body, way, vertical) for way in (side, aside, -side, -aside)]
+    return Camera.from_side(body, way * side, vertical)
 
 
 def scan_shapes(scan: View | Sequence[View], masked: np.ndarray | None = None, metres: float = 1.0
@@ -88,7 +71,7 @@ def completion_panes(scan: View | Sequence[View], completion: Completion, templa
 
     `masked` and `landmarks` are those of `complete`, in the unit of the scan; `names` are those of landmark vertices.
     """
-    camera, scan_parts = sides(completion, template)[0], scan_shapes(scan, masked, completion.scale)
+    camera, scan_parts = view_of(completion, template), scan_shapes(scan, masked, completion.scale)
     marks: list[Shape] = []
     if landmarks is not None:
         labels = [(names or {}).get(int(v), "") for v in landmarks[0]]

@@ -130,11 +130,11 @@ def write_results(work: CompletionTask, inputs: CompletionInputs, files: ScanFil
     done.save(output)
     metrics = [judgement_row(done.judgement), *completion_figures(work, inputs, done, landmarks, masked)]
     # the picture and the page, and a small scene for the page of the folder
-    picture = picture_completion(views, done, work.body.template, masked=masked)
-    save_png(output / "picture.png", picture)
     name = ", ".join(path.name for path in inputs.scans)
     panes = completion_panes(views, done, work.body.template, masked, landmarks,
                              {vertex: name for name, vertex in work.marks.items()})
+    picture = picture_completion(panes, done, work.body.template)
+    save_png(output / "picture.png", picture)
     hidden = masked is not None and bool(masked.any())
     completion_page(panes, name, metrics, picture, hidden).write(output / "report.html")
     if work.command:

@@ -31,7 +31,7 @@ def track_page(motion: Motion, subject: Subject, cloud: Callable[[int], np.ndarr
     page.bodies([moving_pane(motion, subject, [(dots, points)], color=(0.90, 0.78, 0.55))],
                 "Press the triangle to play, drag the body to turn it.", 520)
     page.section("Distance of the points to the body").chart(
-        chart_residuals(motion, "points", lost=True), "mean over the points of a frame, before smoothing")
+        chart_residuals(motion, "points"), "mean over the points of a frame, before smoothing")
     lost = np.array(numbers)[~motion.converged]
     if len(lost):
         page.text("Lost frames: " + _ranges(lost) + ". There the motion is what the frames around it suggest.")

@@ -147,7 +147,7 @@ class ViewApp:
                 self._scene.append(Message("residuals", fields, markers.residuals.astype("<f4").tobytes(),
                                            f"residuals {pane} {layer}"))
             if i in self.bodies:
-                bodies += [Shown(body, content.name, pane, layer + k) for k, body in enumerate(self.bodies[i].layers)]
+                bodies.append(Shown(self.bodies[i], content.name, pane, layer))
         self._notes = tuple(note for content in contents for note in content.notes)
         self.controls.take(bodies)
         self._positions = {}

@@ -27,12 +27,11 @@ def save_poses(controls: Controls, folder: Path) -> list[Path]:
 
 
 def _save(controls: Controls, folder: Path, ending: str, write: Callable[[Path, MovableBody], None]) -> list[Path]:
-    """Write a file for each body, except those that are inner layers of another."""
+    """Write a file for each body."""
     written = []
     for one in controls.shown:
-        if not any(one.body in other.body.layers[1:] for other in controls.shown):
-            written.append(free_name(folder / f"{name_of(one.name)}_{ending}"))
-            write(written[-1], one.body)
+        written.append(free_name(folder / f"{name_of(one.name)}_{ending}"))
+        write(written[-1], one.body)
     return written
 
 

@@ -38,12 +38,6 @@ class MovableStatue(MovableBody):
         fine = subdivide_uniform(statue.control.mesh, statue.control.chart, LEVEL)
         self.detailed = Reconstruction(statue.control, statue.map, fine)
         self._control = np.zeros((0, 3), dtype=np.float32)
-        self.control = MovableBody(model)
-
-    @property
-    def layers(self) -> tuple[MovableBody, ...]:
-        """Return the surface, and the control mesh below it."""
-        return self, self.control
 
     def vertices(self, betas: np.ndarray | None, pose: np.ndarray) -> np.ndarray:
         """Compute the detailed surface (n, 3) float32, metres, relative to the root's joint.
@@ -76,7 +70,7 @@ def read_statue(name: str, folder: Path) -> Content:
 
 
 def of_statue(name: str, statue: Statue, model: BodyModel | None = None) -> Content:
-    """Show the surface of a statue as the scan stood, and hidden at first its control mesh."""
+    """Show the surface of a statue as the scan stood."""
     control = statue.control
     fine = subdivide_uniform(control.mesh, control.chart, LEVEL)
     mesh = Reconstruction(control, statue.map, fine).mesh()
@@ -89,7 +83,6 @@ def of_statue(name: str, statue: Statue, model: BodyModel | None = None) -> Cont
     if statue.texture is not None:
         colors = bilinear(statue.texture, chart_places(control.chart, fine.parent, fine.bary)) / 255
         mesh, shades = Mesh(mesh.vertices, mesh.faces, colors), {"plain": np.array(CLAY), **shades}
-    shapes = [Solid(mesh, shades=shades, name="statue"),
-              Solid(control.mesh, filled, name="control mesh", visible=False)]
-    return Content(name, shapes, Stance.of(mesh), f"{sizes(mesh)}, {len(control.skeleton.parents)} parts",
+    about = f"{sizes(mesh)}, {len(control.skeleton.parents)} parts"
+    return Content(name, [Solid(mesh, shades=shades, name="statue")], Stance.of(mesh), about,
                    model=model or body_model(control), statue=statue)

@@ -90,7 +90,7 @@ def generalisation_rows(shapes: ShapeErrors) -> list[tuple[int, float, float, fl
 
 def error_pane(body: Mesh, distance: np.ndarray, title: str) -> Pane:
     """Draw a body coloured by a distance (N,) in metres."""
-    high = _round_up(float(np.percentile(distance, 99.5)))
+    high = float(np.percentile(distance, 99.5))
     return Pane([Solid(body, Heat(distance, 0.0, high, title))], look_around(body, turns=(20,))[0])
 
 
@@ -102,8 +102,8 @@ def extreme_panes(model: BodyModel, errors: Errors, names: Sequence[str], bodies
     """
     shown = [("best", int(errors.mean.argmin())), ("worst", int(errors.mean.argmax()))]
     made = [make(i) for _, i in shown]
-    high = _round_up(max(float(np.percentile(np.linalg.norm(y - bodies[i], axis=1), 99))
-                         for y, (_, i) in zip(made, shown, strict=True)))
+    high = max(float(np.percentile(np.linalg.norm(y - bodies[i], axis=1), 99))
+               for y, (_, i) in zip(made, shown, strict=True))
     panes = []
     for (word, i), y in zip(shown, made, strict=True):
         turned = model.skeleton.part_rotations(poses[i])[0]
@@ -121,10 +121,3 @@ def picture_samples(model: BodyModel, samples: Samples) -> np.ndarray:
     panes = [Pane([model.template.with_vertices(v)], camera, str(i + 1)) for i, v in enumerate(samples.vertices)]
     rows = max(1, round(np.sqrt(len(panes) / 2.5)))
     return picture_panes(panes, 300, -(-len(panes) // rows))
-
-
-def _round_up(length: float) -> float:
-    """Return the next length whose quarters are round numbers, metres: the end of a colour scale."""
-    power = 10.0 ** np.floor(np.log10(max(length, 1e-9)))
-    steps = (1, 1.2, 1.6, 2, 2.4, 3.2, 4, 6, 8, 10)
-    return float(power * min(step for step in steps if step * power >= length * (1 - 1e-9)))

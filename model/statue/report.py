@@ -2,7 +2,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -20,14 +19,13 @@ from scanprep.pictures.thinning import MOST, thin_solid
 from scanprep.synthetic.people import find_pose, synthesise_walk
 
 from .control.files import humanoid
-from .control.model import FOLDED, HOLE, MEASURED, Statue
+from .control.model import HOLE, Statue
 from .detail.reconstruction import Level, Reconstruction, coverage_at
 from .detail.subdivision import subdivide_uniform
 from .motion.motions import people_motion
 
 HEIGHT = 520                         # pixels of the pictures
 MOVED = MOST // 2                    # triangles of a body that is shown beside others
-KINDS = {MEASURED: (0.62, 0.70, 0.78), FOLDED: (0.86, 0.36, 0.22), HOLE: (0.93, 0.75, 0.42)}
 
 
 def place_camera(statue: Statue, subject: Any, turn: float) -> Camera:
@@ -39,18 +37,14 @@ def place_camera(statue: Statue, subject: Any, turn: float) -> Camera:
 
 
 def statue_picture(scan: Mesh, statue: Statue, level: Level) -> np.ndarray:
-    """Picture scan, control mesh and reconstruction from the front, and scan and reconstruction from behind."""
-    back = place_camera(statue, scan, 200)
-    bare, control, made = first_panes(scan, statue, level)
-    return picture_panes([bare, control, made, replace(bare, camera=back), replace(made, camera=back)], HEIGHT)
+    """Picture scan, control mesh and reconstruction."""
+    return picture_panes(first_panes(scan, statue, level), HEIGHT)
 
 
 def first_panes(scan: Mesh, statue: Statue, level: Level) -> list[Pane]:
     """Draw the scan, the control mesh in the colours of its parts, and the reconstruction."""
     camera = place_camera(statue, scan, 20)
-    coverage = np.array([KINDS[kind] for kind in coverage_of_vertices(statue)])
-    control = Solid(statue.control.mesh, part_colors(statue.control.skeleton.part_of_face), smooth=False,
-                    shades={"measured, folded, hole": coverage})
+    control = Solid(statue.control.mesh, part_colors(statue.control.skeleton.part_of_face), smooth=False)
     return [Pane([Mesh(scan.vertices, scan.faces)], camera, "scan"), Pane([control], camera, "control mesh"),
             Pane([level.mesh], camera, f"reconstruction, {level.name}")]
 
@@ -61,9 +55,7 @@ def statue_page(name: str, scan: Mesh, statue: Statue, levels: Sequence[Level], 
     page = Page(f"{name}, a statue that moves", "A control mesh with a skeleton was fitted to the scan; the detail of "
                 "the scan is an image over it.")
     thinned = "Shown with fewer triangles than it has."
-    page.bodies(first_panes(scan, statue, levels[-1]), thinned + " The control mesh can also be coloured by what the "
-                "scan told: blue was measured, red is folded, not one-to-one with it, yellow is a hole of the scan.",
-                HEIGHT, webp_bytes(picture))
+    page.bodies(first_panes(scan, statue, levels[-1]), thinned, HEIGHT, webp_bytes(picture))
     page.figures(metrics)
     page.section("Joints", "Red: joint centres. Blue: feature points of the control model.")
     control, joints = statue.control, statue.control.skeleton.joints
@@ -74,10 +66,7 @@ def statue_page(name: str, scan: Mesh, statue: Statue, levels: Sequence[Level], 
         Dots(joints, radius=0.0085 * size(control.mesh), on_top=True, name="joints", labels=control.skeleton.names),
         Dots(control.mesh.vertices[marks], (0.15, 0.45, 0.75), 0.006, True, name="feature points", labels=names)],
                       place_camera(statue, scan, 20))], height=HEIGHT)
-    page.section("Levels of detail, and their distance to the scan", "The same map on ever fewer triangles. Grey: "
-                 "holes of the scan, which do not count.")
-    page.table([(one.name, len(one.mesh.vertices), f"{1000 * one.mean:.2f}", f"{1000 * one.rms:.2f}")
-                for one in levels], ("level", "vertices", "mean, mm", "RMS, mm"))
+    page.section("Distance to the scan", "Grey: holes of the scan, which do not count.")
     finest = levels[-1]
     far = Surface(scan).closest(finest.mesh.vertices).distances
     far[finest.mesh.faces[~finest.shown]] = np.nan

@@ -12,14 +12,14 @@ HEAT = "magma_r"      # light where values are low, so that a good result looks 
 NO_VALUE = (0.72, 0.74, 0.76)      # grey, which the colour map does not contain
 
 
-def heat(values: np.ndarray, low: float, high: float, colormap: str = HEAT) -> np.ndarray:
+def heat(values: np.ndarray, low: float, high: float) -> np.ndarray:
     """Convert values to colours (..., 3) in [0, 1] of a perceptually uniform map of matplotlib; NaN becomes grey."""
     from matplotlib import colormaps
 
     values = np.asarray(values, dtype=float)
     place = np.clip((values - low) / max(high - low, 1e-30), 0, 1)
     # leave out the darkest end of the map, where shading would not show
-    colors = colormaps[colormap](np.nan_to_num(place) * (0.86 if colormap == HEAT else 1.0))[..., :3]
+    colors = colormaps[HEAT](np.nan_to_num(place) * 0.86)[..., :3]
     colors[np.isnan(values)] = NO_VALUE
     return colors
 
@@ -33,19 +33,13 @@ class Heat:
     high: float
     title: str = ""  # what the values are
     unit: Literal["mm", "%"] = "mm"  # of the legend: mm for lengths in metres, % for shares
-    colormap: str = HEAT
 
     def colors(self) -> np.ndarray:
         """Compute the colours (N, 3) in [0, 1]."""
-        return heat(self.values, self.low, self.high, self.colormap)
-
-    def bar(self) -> np.ndarray:
-        """Draw the legend."""
-        return color_bar(self.low, self.high, self.title, self.colormap, 1000 if self.unit == "mm" else 100, self.unit)
+        return heat(self.values, self.low, self.high)
 
 
-def color_bar(low: float, high: float, title: str, colormap: str = HEAT, scale: float = 1000.0, unit: str = "mm"
-              ) -> np.ndarray:
+def color_bar(low: float, high: float, title: str, scale: float = 1000.0, unit: str = "mm") -> np.ndarray:
     """Draw a legend (H, W, 3) uint8 for `heat`; the numbers on it are `scale` times `low` to `high`, in `unit`."""
     from PIL import Image, ImageDraw
 
@@ -56,7 +50,7 @@ def color_bar(low: float, high: float, title: str, colormap: str = HEAT, scale: 
     image = Image.new("RGB", (width, top + thick + 26), "white")
     draw = ImageDraw.Draw(image)
     draw.text((width / 2, 4), title, fill=INK, anchor="ma", font=font(14))
-    ramp = heat(np.linspace(low, high, width - 2 * pad), low, high, colormap)
+    ramp = heat(np.linspace(low, high, width - 2 * pad), low, high)
     image.paste(Image.fromarray(np.repeat((255 * ramp[None] + 0.5).astype(np.uint8), thick, axis=0)), (pad, top))
     # five ticks with their values; the last one has the unit
     for place in np.linspace(0, 1, 5):

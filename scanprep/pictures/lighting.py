@@ -1,4 +1,4 @@
-"""Light on triangles under a camera: ray casting, visibility, shading, and the canvas that collects the result."""
+"""Light on triangles under a camera: ray casting, shading, and the canvas that collects the result."""
 from __future__ import annotations
 
 from collections.abc import Sequence
@@ -7,7 +7,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..geometry.format_common import as_seen
-from ..geometry.sparse import unique_integers
 
 # Three-point lighting: directions in the camera's frame (right, up, back) and linear strengths. The key light models
 # the form, the fill softens its shadows, the rim light from behind separates the body from the background.
@@ -18,17 +17,11 @@ SKY, BOUNCE = np.array([0.32, 0.34, 0.38]), np.array([0.20, 0.175, 0.16])
 
 @dataclass(frozen=True, eq=False)
 class LitTriangles:
-    """Triangles to be lit: corners (F, 3, 3) with unit normals and linear colours, both (F, 3, 3).
-
-    Shapes that receive shadows also have the vertex numbers (F, 3) of the corners, and the normals (N, 3) of the
-    vertices.
-    """
+    """Triangles to be lit: corners (F, 3, 3) with unit normals and linear colours, both (F, 3, 3)."""
 
     corners: np.ndarray
     normals: np.ndarray
     colors: np.ndarray
-    faces: np.ndarray | None = None
-    vertex_normals: np.ndarray | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,16 +45,11 @@ class Scene:
         self.corners = np.concatenate([s.corners for s in shapes]).astype(np.float32)
         c = self.corners
         self.outward = np.cross(c[:, 1] - c[:, 0], c[:, 2] - c[:, 0])
-        self._shapes = shapes
-        self._starts = np.cumsum([0] + [len(s.corners) for s in shapes])
-        # of every corner: normal (3), colour (3), visibility of the sky and of the key light; interpolated together
-        self.attributes = np.ones((len(self.corners), 3, 8), dtype=np.float32)
-        self.attributes[..., :3] = np.concatenate([s.normals for s in shapes])
-        self.attributes[..., 3:6] = np.concatenate([s.colors for s in shapes])
+        # of every corner: normal (3), colour (3); interpolated together
+        self.attributes = np.concatenate([np.concatenate([s.normals, s.colors], axis=2) for s in shapes]
+                                         ).astype(np.float32)
         self._tree = EmbreeScene()
-        self._kept = TriangleMesh(self._tree, *_merge_shapes(shapes))
-        span = self.corners.reshape(-1, 3)
-        self.size = float(np.linalg.norm(np.ptp(span, axis=0))) if len(span) else 1.0
+        self._kept = TriangleMesh(self._tree, c.reshape(-1, 3), np.arange(3 * len(c), dtype=np.int32).reshape(-1, 3))
 
     def cast(self, origins: np.ndarray, directions: np.ndarray) -> Seen:
         """Cast rays, and shade what they hit."""
@@ -70,48 +58,16 @@ class Scene:
         hit = self._tree.run(np.ascontiguousarray(origins), np.ascontiguousarray(directions), output=True)
         rays = np.flatnonzero(hit["primID"] >= 0)
         face = hit["primID"][rays]
-        # compute the visibility at the corners of the triangles in sight only
-        faces = unique_integers(face)
-        # 48 directions from each vertex: 80 look the same, and take 1.7 times as long
-        sky = sphere_directions(48)
-        # a light of 0.16 radians gives soft shadows
-        key = cone_directions(_unit(np.array(KEY[0])) @ self.axes, 0.16, 14)
-        for shape, start, end in zip(self._shapes, self._starts[:-1], self._starts[1:], strict=True):
-            own_faces = faces[(faces >= start) & (faces < end)] - start
-            if shape.faces is None or shape.vertex_normals is None or not len(own_faces):
-                continue
-            vertices, first = np.unique(shape.faces[own_faces], return_index=True)
-            points = shape.corners[own_faces].reshape(-1, 3)[first]
-            normals = shape.vertex_normals[vertices]
-            light = np.ones((len(shape.vertex_normals), 2), dtype=np.float32)
-            # ambient occlusion looks as far as a third of the scene, shadows reach through all of it
-            light[vertices, 0] = self._open(points, normals, sky, 0.30 * self.size)
-            light[vertices, 1] = self._open(points, normals, key, 4 * self.size)
-            self.attributes[start + own_faces, :, 6:] = light[shape.faces[own_faces]]
         # interpolate at the place that each ray hits
         u, v = hit["u"][rays], hit["v"][rays]
         bary = np.stack([1 - u - v, u, v], axis=1)
         return Seen(rays, *self._shade(face, bary, directions[rays]), hit["tfar"][rays])
 
-    def _open(self, points: np.ndarray, normals: np.ndarray, directions: np.ndarray, reach: float) -> np.ndarray:
-        """Compute the cosine-weighted share of directions (k, 3) in which points (n, 3) see no obstacle."""
-        cosine = np.maximum(normals @ directions.T, 0)
-        point, direction = np.nonzero(cosine > 0.05)
-        # start a little off the surface, so that a ray does not hit its own triangle
-        start = (points + 2e-3 * self.size * normals).astype(np.float32)[point]
-        along = directions.astype(np.float32)[direction]
-        far = np.full(len(point), reach, dtype=np.float32)
-        blocked = self._tree.run(start, along, far, query="OCCLUDED") >= 0
-        weight = cosine[point, direction]
-        total = np.bincount(point, weight, len(points))
-        clear = np.bincount(point, weight * ~blocked, len(points))
-        return np.divide(clear, total, out=np.ones(len(points)), where=total > 1e-9)
-
     def _shade(self, face: np.ndarray, bary: np.ndarray, directions: np.ndarray
                ) -> tuple[np.ndarray, np.ndarray]:
         """Compute the linear colour (n, 3) of points on triangles, and the cosine between ray and normal."""
         at = np.einsum("nc,ncd->nd", bary, self.attributes[face])
-        normal, color, ambient, key_light = at[:, :3], at[:, 3:6], at[:, 6, None], at[:, 7, None]
+        normal, color = at[:, :3], at[:, 3:6]
         inner = np.einsum("nd,nd->n", self.outward[face], directions) > 0
         # seen from inside, the normal is turned towards the camera
         normal = _unit(normal) * np.where(inner, -1, 1)[:, None].astype(np.float32)
@@ -126,29 +82,10 @@ class Scene:
         # Blinn-Phong highlight of the key light, and a brighter edge at grazing angles
         half = _unit(lights[0] - directions)
         gloss = np.maximum(np.einsum("nd,nd->n", normal, half), 0)[:, None] ** 24
-        ambient = ambient ** 1.2
-        diffuse = sky * ambient + KEY[1] * key * key_light + FILL[1] * fill * ambient + RIM[1] * rim * ambient
-        sheen = 0.07 * gloss * key_light + 0.10 * (1 - facing) ** 4 * ambient
+        diffuse = sky + KEY[1] * key + FILL[1] * fill + RIM[1] * rim
+        sheen = 0.07 * gloss + 0.10 * (1 - facing) ** 4
         return color * diffuse + np.where(inner[:, None], 0, sheen), facing[:, 0]
 
-
-
-def _merge_shapes(shapes: Sequence[LitTriangles]) -> tuple[np.ndarray, np.ndarray]:
-    """Merge shapes into vertices (n, 3) float32 and triangles (F, 3) int32.
-
-    Corners share their vertices where possible, which speeds up the search tree.
-    """
-    vertices, faces, count = [np.zeros((0, 3))], [np.zeros((0, 3), dtype=np.int64)], 0
-    for shape in shapes:
-        if shape.faces is None or shape.vertex_normals is None:
-            shape_faces, places = np.arange(3 * len(shape.corners)).reshape(-1, 3), shape.corners.reshape(-1, 3)
-        else:
-            shape_faces, places = shape.faces, np.zeros_like(shape.vertex_normals)
-            places[shape_faces] = shape.corners
-        vertices.append(places)
-        faces.append(shape_faces + count)
-        count += len(places)
-    return np.concatenate(vertices).astype(np.float32), np.concatenate(faces).astype(np.int32)
 
 
 class Canvas:
@@ -192,15 +129,6 @@ def sphere_directions(count: int) -> np.ndarray:
     angle = np.pi * (3 - 5 ** 0.5) * np.arange(count)
     r = np.sqrt(1 - z * z)
     return np.stack([r * np.cos(angle), r * np.sin(angle), z], axis=1)
-
-
-def cone_directions(axis: np.ndarray, radius: float, count: int) -> np.ndarray:
-    """Make unit vectors (count, 3) around an axis, at most `radius` radians away."""
-    aside = _unit(np.cross(axis, np.eye(3)[np.abs(axis).argmin()]))
-    r = radius * np.sqrt((np.arange(count) + 0.5) / count)
-    angle = np.pi * (3 - 5 ** 0.5) * np.arange(count)
-    around = np.cos(angle)[:, None] * aside + np.sin(angle)[:, None] * np.cross(axis, aside)
-    return _unit(axis + r[:, None] * around)
 
 
 def _unit(v: np.ndarray) -> np.ndarray:

@@ -45,7 +45,6 @@ class Page:
         self.title, self.lead = title, lead
         self._parts: list[str] = []
         self._verdict = ""
-        self._styles: list[str] = []
         self._sections: list[str] = []
         self._scenes: list[bytes] = []
 
@@ -67,11 +66,9 @@ class Page:
         self._verdict = f'<p class="verdict {judgement.verdict}"><b>{judgement.verdict}</b>{reasons}{below}</p>\n'
         return self
 
-    def markup(self, html: str, style: str = "") -> Page:
-        """Add raw HTML, for what the other methods cannot show, and the CSS rules that it needs, once each."""
+    def markup(self, html: str) -> Page:
+        """Add raw HTML, for what the other methods cannot show."""
         self._parts.append(html)
-        if style and style not in self._styles:
-            self._styles.append(style)
         return self
 
     def picture(self, image: np.ndarray | bytes, caption: str = "", alt: str = "") -> Page:
@@ -135,7 +132,7 @@ class Page:
 
     def html(self) -> str:
         """Return the whole page."""
-        style = Path(__file__).with_name("page.css").read_text(encoding="utf-8") + "".join(self._styles)
+        style = Path(__file__).with_name("page.css").read_text(encoding="utf-8")
         style += (VIEWER / "viewer.css").read_text(encoding="utf-8") if self._scenes else ""
         lead = f'<p class="lead">{_with_code(self.lead)}</p>' if self.lead else ""
         # a table of contents, from three sections on

@@ -174,7 +174,7 @@ def _shade(name: str, shade: Any, mesh: Mesh | None, columns: _Columns) -> dict[
         # values: an index into 255 colours, the last entry for vertices without a value
         share = (shade.values - shade.low) / max(shade.high - shade.low, 1e-30)
         index = np.where(np.isnan(share), NO_INDEX, np.round((NO_INDEX - 1) * np.clip(np.nan_to_num(share), 0, 1)))
-        ramp = heat(np.append(np.linspace(0, 1, NO_INDEX), np.nan), 0, 1, shade.colormap)
+        ramp = heat(np.append(np.linspace(0, 1, NO_INDEX), np.nan), 0, 1)
         return {"name": name or shade.title, "index": columns.add(index.astype(np.uint8)),
                 "palette": _hex(np.round(255 * ramp)),
                 "legend": {"title": shade.title, "low": shade.low, "high": shade.high, "unit": shade.unit,

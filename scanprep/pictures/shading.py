@@ -1,7 +1,6 @@
 """Render shaded pictures by ray casting, without graphics card or display.
 
-Key, fill and rim light move with the camera. Ambient occlusion and the soft shadow of the key light are computed at
-the visible vertices and interpolated, which avoids noise.
+Key, fill and rim light move with the camera.
 """
 from __future__ import annotations
 
@@ -111,7 +110,7 @@ def render(shapes: Shape | Sequence[Shape], camera: Camera, width: int, height: 
     everything = [shapes] if isinstance(shapes, Shape) else list(shapes)
     origins, directions = camera.rays(width, height, samples=2)
     canvas = Canvas(len(origins))
-    # opaque shapes in one search tree, so that they cast shadows on each other
+    # opaque shapes in one search tree
     solid = [s for s in everything if not _on_top(s) and _opacity(s) == 1]
     if solid:
         canvas.cover(_scene(solid, camera).cast(origins, directions))
@@ -149,8 +148,7 @@ def _triangles(shape: Shape, origin: np.ndarray) -> LitTriangles:
         flat = np.broadcast_to(mesh.face_normals[:, None], mesh.corners.shape)
         normals = mesh.vertex_normals[mesh.faces] if shape.smooth else flat
         color = own_color(shape)
-        return LitTriangles(mesh.corners - origin, normals, _corner_colors(np.asarray(color, dtype=float), mesh),
-                            mesh.faces, mesh.vertex_normals)
+        return LitTriangles(mesh.corners - origin, normals, _corner_colors(np.asarray(color, dtype=float), mesh))
     if isinstance(shape, Dots):
         points = np.atleast_2d(np.asarray(shape.points, dtype=float))
         finite = np.isfinite(points).all(axis=1)

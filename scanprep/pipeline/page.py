@@ -8,7 +8,6 @@ from pathlib import Path
 from urllib.parse import quote
 
 import numpy as np
-from scipy.sparse import eye_array
 
 from ..dataset import RegisteredSet, SetEntry
 from ..geometry import rotations
@@ -18,10 +17,11 @@ from ..geometry.mesh import Mesh
 from ..judgement import Judgement, judge_many
 from ..judgement import size as size_of
 from ..pictures.camera import Camera, look_around
-from ..pictures.page import Page, data_uri
-from ..pictures.scene import Pane, embed_files, small_scene, worst_that_turn
+from ..pictures.page import Page
+from ..pictures.scene import SMALL, Pane, small_scene, worst_that_turn
 from ..pictures.shading import CLAY, Dots, Heat, Shape, Solid, color_bar, part_colors, render
 from ..pictures.sheets import webp_bytes
+from ..pictures.thinning import thin_solid
 from ..registration.figures import (
     UNSEEN,
     Limits,
@@ -38,7 +38,6 @@ from .rivals import RIVALS, doubt_rivals
 
 PICTURES, PAGE = "pictures", "report.html"     # folder and file inside the set
 WIDTH, HEIGHT = 150, 216    # pixels of one picture: five side by side fit on the page, of a standing person
-MOST_CARRIED = 4_000_000    # bytes of pictures inside the page, worst scans first; the rest stay files beside it
 FAR = 0.005                 # share of the template's size at the dark end of the distance colours, 7 mm on a person
 TURN = 20.0                 # degrees from the front: shows depth, and the face
 
@@ -59,22 +58,20 @@ def write_set_page(folder: str | Path, limits: Limits | None = None, to: Path | 
     page = Page(f"Scans of {folder.absolute().name}",
                 f"{number_of(len(verdicts), 'scan')}: {', '.join(parts) or 'all within their limits'}.")
     page.verdict(judge_whole(verdicts, registered, limits))
-    page.markup("", Path(__file__).with_name("page.css").read_text(encoding="utf-8"))
+    page.markup(f"<style>{Path(__file__).with_name('page.css').read_text(encoding='utf-8')}</style>")
     page.table(_summary(verdicts), ("", "median", "worst", "unit"))
-    page.section("Subjects", "Every scan, by subject: green is fine, amber needs a look, red could not be registered.")
-    page.markup(_index(verdicts, entries))
-    page.section("Worst first", _explanation(limits, size))
+    page.section("Worst first", "Green is fine, amber needs a look, red could not be registered.\n\n"
+                 + _explanation(limits, size))
     page.picture(color_bar(0, FAR * size, "distance to the scan; grey: no data there"))
-    # pictures and scenes of the worst scans are carried by the page, as far as its size allows
+    # scenes of the worst scans are carried by the page, as far as its size allows
     shots = [folder / pictures_place(entries.get(verdict.name)) / verdict.name for verdict in verdicts]
     scenes = worst_that_turn([shot.with_name(f"{shot.name}.scene") for shot in shots])
-    pictures = embed_files((shot.with_name(f"{shot.name}.webp") for shot in shots), MOST_CARRIED)
     # every scan that needs a look can be turned, and at least six
     look = max(6, sum(verdict.suspect or verdict.failed for verdict in verdicts))
-    for number, (verdict, scene, picture) in enumerate(zip(verdicts, scenes, pictures, strict=True)):
+    for number, (verdict, scene) in enumerate(zip(verdicts, scenes, strict=True)):
         entry = entries.get(verdict.name)
-        view = _scan_view(page, folder, pictures_place(entry), verdict.name, picture, scene if number < look else None)
-        rival = _scan_view(page, folder, pictures_place(entry).with_name(RIVALS), verdict.name, None, None)
+        view = _scan_view(page, folder, pictures_place(entry), verdict.name, scene if number < look else None)
+        rival = _scan_view(page, folder, pictures_place(entry).with_name(RIVALS), verdict.name, None)
         page.markup(_card(verdict, entry, view, rival))
     if registered.skeleton is not None:
         page.section("Skeleton", f"{len(registered.skeleton.parents)} parts: {', '.join(registered.skeleton.names)}.")
@@ -156,23 +153,6 @@ def _explanation(limits: Limits, size: float) -> str:
         "does both in the browser.")
 
 
-def _index(verdicts: Sequence[Verdict], entries: dict[str, SetEntry]) -> str:
-    """Return HTML with a link to every scan, grouped by subject."""
-    groups: dict[str, list[tuple[str, Verdict]]] = {}
-    for verdict in sorted(verdicts, key=lambda v: v.name):
-        entry = entries.get(verdict.name)
-        subject = entry.subject if entry else ""
-        groups.setdefault(subject or "not registered", []).append((entry.pose if entry else "", verdict))
-    parts = []
-    for subject, members in sorted(groups.items()):
-        links = "".join(f'<a href="#{_anchor(v)}" title="{escape(v.name)}"><span class="dot {_mark(v)}"></span>'
-                        f"{escape(pose or v.name)}</a>" for pose, v in members)
-        # a subject with one scan of the same name needs no heading
-        alone = len(members) == 1 and members[0][1].name == subject
-        parts.append(f"<span>{'' if alone else f'<b>{escape(subject)}</b>'}{links}</span>")
-    return f'<div class="index">{"".join(parts)}</div>'
-
-
 def _card(verdict: Verdict, entry: SetEntry | None, shown: str, rival: str) -> str:
     """Return HTML of one scan: its figures, reasons and pictures."""
     f, table = verdict.figures, ""
@@ -193,19 +173,20 @@ def _card(verdict: Verdict, entry: SetEntry | None, shown: str, rival: str) -> s
                 *([("right within 20 mm, probability", f"{100 * verdict.right:.0f}%")] if verdict.right >= 0 else []))
         table = "<table>" + "".join(f'<tr><td>{name}</td><td class="number">{value}</td></tr>'
                                     for name, value in rows) + "</table>"
-    return (f'<section class="scan {_mark(verdict)}" id="{_anchor(verdict)}"><h3><span class="dot"></span>'
+    return (f'<section class="scan {_mark(verdict)}"><h3><span class="dot"></span>'
             f"{escape(verdict.name)} <small>{badness}</small><small>{escape(about)}</small></h3>"
             f"<ul>{reasons}</ul>{shown}{table}"
             + (f"<div><h4>the other body that explains the scan</h4>{rival}</div>" if rival else "") + "</section>")
 
 
-def _scan_view(page: Page, folder: Path, place: Path, name: str, picture: bytes | None, scene: bytes | None) -> str:
-    """Return HTML of a scan that turns, or of its picture, which is inside the page or a file beside it."""
-    if picture is not None and scene is not None:
-        return page.turning(scene, picture, height=300)
-    if picture is None and not (folder / place / f"{name}.webp").exists():
+def _scan_view(page: Page, folder: Path, place: Path, name: str, scene: bytes | None) -> str:
+    """Return HTML of a scan that turns, or of its picture, a file beside the page."""
+    picture = folder / place / f"{name}.webp"
+    if not picture.exists():
         return ""
-    source = data_uri(picture) if picture is not None else quote((place / f"{name}.webp").as_posix())
+    if scene is not None:
+        return page.turning(scene, picture.read_bytes(), height=300)
+    source = quote((place / f"{name}.webp").as_posix())
     labels = "".join(f"<span>{escape(label)}</span>" for label in PANELS)
     return (f'<div><img src="{source}" alt="{escape(name)}: {", ".join(PANELS)}" '
             f'width="{WIDTH * len(PANELS)}" height="{HEIGHT}" loading="lazy" decoding="async">'
@@ -215,11 +196,6 @@ def _scan_view(page: Page, folder: Path, place: Path, name: str, picture: bytes 
 def _mark(verdict: Verdict) -> str:
     """Return the CSS class of a verdict."""
     return "failed" if verdict.failed else "look" if verdict.suspect else "fine"
-
-
-def _anchor(verdict: Verdict) -> str:
-    """Return the HTML id of a scan."""
-    return "scan-" + escape(verdict.name.replace(" ", "_"))
 
 
 def pictures_of(template: Mesh, scan: Mesh | np.ndarray, fit: Registration) -> tuple[bytes, bytes]:
@@ -234,46 +210,22 @@ def pictures_of(template: Mesh, scan: Mesh | np.ndarray, fit: Registration) -> t
     front, back = (replace(c, width=1.06 * c.width, height=1.06 * c.height)
                    for c in look_around(template, body.vertices, (TURN, TURN + 180)))
     # the scan, turned like the body, with only as much detail as a small picture shows
-    size, ball = size_of(template), 0.013 * size_of(template)
+    size = size_of(template)
     raw: Solid | Dots
     if isinstance(scan, Mesh) and len(scan.faces):
-        coarse = cluster_vertices(scan, 0.007 * size)
-        raw = Solid(coarse.with_vertices((coarse.vertices - middle) @ R.T))
+        raw = thin_solid(Solid(scan.with_vertices((scan.vertices - middle) @ R.T)), SMALL)
     else:
         points = scan.vertices if isinstance(scan, Mesh) else scan
+        ball = 0.013 * size
         raw = Dots((points[thin(points, 1.25 * ball)] - middle) @ R.T, CLAY, ball)
-    far = Heat(smooth_values(body, fit.distances), 0, FAR * size, "distance to the scan")
-    sure = Heat(1 - fit.confidence, -0.35, 1, colormap="Blues")     # not the colours of the distances
+    far = Heat(fit.distances, 0, FAR * size, "distance to the scan")
+    sure = Heat(1 - fit.confidence, 0, 1)
     shown: list[tuple[Shape, Camera]] = [
         (raw, front), (Solid(body, CLAY), front), (Solid(body, far), front), (Solid(body, far), back),
         (Solid(body, sure), front)]
     strip = webp_bytes(np.concatenate([render(shape, camera, WIDTH, HEIGHT) for shape, camera in shown], axis=1))
     # for the browser: the body in several colourings, the scan over it hidden at first
     registered = Solid(body, far, name="registered template", shades={
-        "confidence": Heat(fit.confidence, 0, 1, "confidence", "%", "Blues_r"), "plain": np.array(CLAY)})
+        "not sure": Heat(1 - fit.confidence, 0, 1, "not sure", "%"), "plain": np.array(CLAY)})
     over = replace(raw, name="scan over it", visible=False)
     return strip, small_scene([Pane([raw], front, "scan"), Pane([registered, over], front, "the template on it")])
-
-
-def smooth_values(mesh: Mesh, values: np.ndarray) -> np.ndarray:
-    """Average values (N,) with those of neighbours, so that noise fades and misfit stays; NaN stays NaN."""
-    known = np.isfinite(values)
-    weights = mesh.vertex_adjacency.astype(float) + eye_array(len(values))
-    # two rounds reach the second ring of neighbours
-    for _ in range(2):
-        total = weights @ np.where(known, values, 0.0)
-        values = np.where(known, total / np.maximum(weights @ known.astype(float), 1.0), np.nan)
-    return values
-
-
-def cluster_vertices(mesh: Mesh, cell: float) -> Mesh:
-    """Merge the vertices inside each cubic cell (metres); for pictures only, as it may not be manifold."""
-    key = np.floor((mesh.vertices - mesh.vertices.min(axis=0)) / cell).astype(np.int64)
-    _, first, place = np.unique(key, axis=0, return_index=True, return_inverse=True)
-    faces = place.reshape(-1)[mesh.faces]
-    # triangles inside one cell have collapsed
-    apart = (faces[:, 0] != faces[:, 1]) & (faces[:, 1] != faces[:, 2]) & (faces[:, 2] != faces[:, 0])
-    count = np.bincount(place.reshape(-1))
-    means = np.stack([np.bincount(place.reshape(-1), axis) / count for axis in mesh.vertices.T], axis=1)
-    colors = None if mesh.colors is None else mesh.colors[first]
-    return Mesh(means, faces[apart], colors)

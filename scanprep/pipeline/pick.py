@@ -35,8 +35,8 @@ def pick_landmarks(mesh: MeshArg, scans: ScansArg = (), names: str = "ten", form
     Args:
         mesh: The template, or any mesh whose landmarks are wanted; or the folder of a registered set.
         scans: Scans to click the same landmarks on, one after the other, or folders of them.
-        names: Names to offer beside those that are there already: "ten" for people, "caesar" for the 73 of CAESAR, or
-            a text file with one name in each line.
+        names: Names to offer beside those that are there already: "ten" for people, or a text file with one name
+            in each line.
         format: Of new landmark files, which are written beside each scan with its name: json, csv, pp (MeshLab),
             mrk.json (3D Slicer). A file of these formats that is there keeps its own, and a copy of it as it was.
         unit: Unit of the scans and of their landmarks; of the mesh, if there are no scans.

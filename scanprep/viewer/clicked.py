@@ -7,7 +7,6 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from ..alignment.icp import landmark_motion
 from ..depth_camera.picture import is_picture, read_depth
@@ -141,40 +140,20 @@ def as_mesh(shape: Mesh | np.ndarray) -> Mesh:
     return shape if isinstance(shape, Mesh) else Mesh(shape, np.zeros((0, 3), dtype=np.int64))
 
 
-def camera_like(first: Camera, template: np.ndarray, body: Mesh | np.ndarray,
-                landmarks: tuple[np.ndarray, np.ndarray] | None) -> Camera:
-    """Return a view of a body from the same side from which a camera sees a template, points (n, 3).
+def camera_like(first: Camera, body: Mesh | np.ndarray, landmarks: tuple[np.ndarray, np.ndarray] | None) -> Camera:
+    """Return a view of a body from the side from which a camera sees a template, by landmarks (L, 3) of both.
 
-    The side follows from landmarks (L, 3) of both, at least three. Without them it is the turn about the vertical at
-    which both shapes match best. A one-sided scan is never seen from its inside.
+    Without landmarks, at least three, it is the body's own front. A one-sided scan is never seen from its inside.
     """
     own_view = camera_of(body)
+    if landmarks is None:
+        return own_view
+    # turn the template's view like the body; a view from above or below is not helpful
     points, outward = as_mesh(body).vertices, outer_side(as_mesh(body), int(np.abs(own_view.vertical).argmax()))
-    if landmarks is not None:
-        # with landmarks: turn the template's view like the body; a view from above or below is not helpful
-        R_body_template = landmark_motion(*landmarks)[:3, :3]
-        side = R_body_template @ first.axes[2]
-        outside = outward is None or side @ outward > np.cos(np.radians(MOST_ASIDE))
-        return Camera.from_side(points, side, own_view.vertical) \
-            if outside and abs(side @ own_view.vertical) < 0.9 else own_view
-
-    def seen(camera: Camera, all_points: np.ndarray, turn: float = 0.0) -> np.ndarray:
-        """Return a sample of points as right, up and towards a turned camera, in units of their height."""
-        flat = camera.axes[2] - (camera.axes[2] @ camera.vertical) * camera.vertical
-        flat = flat / np.linalg.norm(flat)
-        right = np.cross(camera.vertical, flat)
-        back, across = np.cos(turn) * flat + np.sin(turn) * right, np.cos(turn) * right - np.sin(turn) * flat
-        # 1500 points are enough to compare two shapes; a fixed seed gives the same view every time
-        sample = all_points[np.random.default_rng(0).permutation(len(all_points))[:1500]]
-        local = sample @ np.stack([across, camera.vertical, back]).T
-        return np.asarray((local - np.median(local, axis=0)) / max(float(np.ptp(local[:, 1])), 1e-12))
-
-    target = cKDTree(seen(first, template))
-    # try turns in steps of 15 degrees; a one-sided scan's own view is from the middle of its outside
-    turns = np.radians(np.arange(0, 360, 15) if outward is None else np.arange(-MOST_ASIDE, MOST_ASIDE + 1, 15))
-    best = min(turns, key=lambda turn: float(target.query(seen(own_view, points, turn))[0].mean()))
-    right = np.cross(own_view.vertical, own_view.axes[2])
-    return Camera.from_side(points, np.cos(best) * own_view.axes[2] + np.sin(best) * right, own_view.vertical)
+    side = landmark_motion(*landmarks)[:3, :3] @ first.axes[2]
+    outside = outward is None or side @ outward > np.cos(np.radians(MOST_ASIDE))
+    return Camera.from_side(points, side, own_view.vertical) \
+        if outside and abs(side @ own_view.vertical) < 0.9 else own_view
 
 
 def predict_landmarks(template: Mesh, on_template: Mapping[str, np.ndarray], body: Clickable,

@@ -1,4 +1,4 @@
-"""Names of landmarks to click: a good ten, the 73 of CAESAR, joints and points of the face, or those of a file."""
+"""Names of landmarks to click: a good ten, joints and points of the face, or those of a file."""
 from __future__ import annotations
 
 from pathlib import Path
@@ -7,17 +7,6 @@ from ..arguments import UsageError
 from ..geometry import storage
 from ..geometry.landmark_names import FACE, TEN
 from ..geometry.sides import other_side
-
-# landmarks of the CAESAR survey, spelt as in its files: on the middle line, and on both sides of the body
-_MIDDLE = ("Sellion", "Supramenton", "Nuchale", "Suprasternale", "Substernale", "Cervicale", "10th Rib Midspine",
-           "Waist, Preferred, Post.", "Crotch")
-_PAIRED = ("Infraorbitale", "Tragion", "Gonion", "Clavicale", "Thelion/Bustpoint", "10th Rib", "ASIS", "Iliocristale",
-           "Trochanterion", "PSIS", "Acromion", "Axilla, Ant.", "Axilla, Post.", "Radial Styloid", "Ulnar Styloid",
-           "Olecranon", "Humeral Lateral Epicn.", "Humeral Medial Epicn.", "Radiale", "Metacarpal Phal. II",
-           "Metacarpal Phal. V", "Dactylion", "Knee Crease", "Femoral Lateral Epicn.", "Femoral Medial Epicn.",
-           "Metatarsal Phal. I", "Metatarsal Phal. V", "Lateral Malleolus", "Medial Malleolus", "Sphyrion",
-           "Calcaneous, Post.", "Digit II")
-CAESAR = (*_MIDDLE, *(f"{side} {name}" for name in _PAIRED for side in ("Rt.", "Lt.")))
 
 # joints of the generic humanoid of `scape statue` and points of the face, and what to aim at
 HUMANOID = ("l_shoulder", "r_shoulder", "l_elbow", "r_elbow", "l_wrist", "r_wrist", "l_hip", "r_hip", "l_knee",
@@ -29,7 +18,7 @@ AIMS = {"shoulder": "middle of the rounded end of the shoulder",
         "sternoclavicular": "inner end of the collar bone"}
 
 # words that stand for a list on the command line
-LISTS = {"ten": TEN, "caesar": CAESAR}
+LISTS = {"ten": TEN}
 
 
 def read_names(word: str) -> tuple[str, ...]:

@@ -98,13 +98,12 @@ class PickApp:
         if is_picture(self.scan.path):
             return pane
         pairs = pair_names(self.template.places, self.scan.places)
-        template, body = self.template.body.points, self.scan.body.shape
         # names may be spelt differently on scan and template, so they are paired by meaning
         landmarks = None
         if len(pairs) >= self.ENOUGH:
             landmarks = (np.array([self.template.places[on_template] for on_template, _ in pairs]),
                          np.array([self.scan.places[on_scan] for _, on_scan in pairs]))
-        return replace(pane, camera=camera_like(camera_of(self.template.body.shape), template, body, landmarks))
+        return replace(pane, camera=camera_like(camera_of(self.template.body.shape), self.scan.body.shape, landmarks))
 
     def state(self) -> Message:
         """Return everything but the bodies."""

@@ -9,20 +9,18 @@ from model.body import BodyModel
 from scanprep.cli import MM
 from scanprep.console import Metric
 from scanprep.folders import add_entry, as_line
-from scanprep.geometry.farthest_points import spread_indices
 from scanprep.pictures.page import Page
 from scanprep.pictures.scene import picture_pane
 from scanprep.pictures.shading import contact_sheet
 from scanprep.pictures.sheets import webp_bytes
 
-from ...motion_pictures import marker_rows, mean_over, worst_frames
+from ...motion_pictures import chart_residuals, frame_panes, mean_over, show_markers, worst_frames
 from ..files.force_plates import GroundReactions
 from ..gait.cycles import GaitCycles
 from ..gait.pictures import chart_cycles, chart_forces
 from ..marker_sets.layout import MarkerLayout
 from . import pictures
 from .mosh import MoshResult
-from .pictures import chart_frames, chart_timeline
 from .takes import Take
 
 
@@ -31,12 +29,13 @@ def person_page(name: str, model: BodyModel, result: MoshResult, usual: MarkerLa
     """Make the page of a person: shape, markers before and after, links to its sequences and their figures."""
     body, labels, misplaced = pictures.person_in_mean_pose(model, result.betas), result.layout.labels, result.misplaced
     before = usual.select(labels)
-    found, moved = pictures.change_of_place(body, before, result.layout)
+    found, places = result.layout.place(body), before.place(body)
+    moved = np.linalg.norm(found - places, axis=1)
     # the body with its markers, and the sequences
     page = Page(f"{name}: body shape and markers",
                 f"Found from the markers of {len(takes)} {'sequence' if len(takes) == 1 else 'sequences'} alone.")
-    ways = [f"{label}: {MM * far:.0f} mm" for label, far in zip(labels, np.linalg.norm(moved, axis=1), strict=True)]
-    page.bodies([pictures.person_pane(body, found, before.place(body), ways)],
+    ways = [f"{label}: {MM * far:.0f} mm" for label, far in zip(labels, moved, strict=True)]
+    page.bodies([pictures.person_pane(body, found, places, ways)],
                 "the body in the mean pose of the model's people; red: where the markers sat, blue: where the layout "
                 "has them, with a rod from the one to the other", 520)
     page.section("Sequences")
@@ -61,14 +60,12 @@ def person_page(name: str, model: BodyModel, result: MoshResult, usual: MarkerLa
         for label, column in zip(take.motion.labels, take.motion.residuals.T, strict=True):
             left.setdefault(label, []).append(column)
     lifts = np.asarray(before.distances), np.asarray(result.layout.distances)
-    rows = [(label, MM * float(np.linalg.norm(moved[i])), *(MM * moved[i]).round(1).tolist(),
-             *(MM * float(lift[i]) for lift in lifts),
+    rows = [(label, MM * float(moved[i]), *(MM * float(lift[i]) for lift in lifts),
              MM * float(mean_over(np.concatenate(left.get(label, [np.array([np.nan])])), 0)))
             for i, label in enumerate(before.labels)]
     page.section("Markers before and after", "From where the layout has each marker to where it was found.")
     page.table(sorted(rows, key=lambda row: -row[1]),
-               ("marker", "moved (mm)", "up (mm)", "forward (mm)", "to the left (mm)", "off the skin, layout (mm)",
-                "found (mm)", "distance left, fixed shape (mm)"))
+               ("marker", "moved (mm)", "off the skin, layout (mm)", "found (mm)", "distance left, fixed shape (mm)"))
     if before.loose:
         page.text(f"Loose markers, which may sit anywhere on their limb: {', '.join(before.loose)}.")
     return page.section("Figures").figures(metrics)
@@ -87,24 +84,14 @@ def take_page(take: Take, metrics: Sequence[Metric], picture: np.ndarray, gait: 
         520, webp_bytes(picture))
     show_walk(page, gait, reactions)
     page.section("Distance of the markers", "From where the body has them to where they were measured.")
-    page.chart(chart_frames(take), "mean of the markers, over time")
-    page.bodies(pictures.take_frame_panes(take, worst_frames(take.shown, 5)), "the frames in which they are farthest",
-                300)
-    # a table of markers, the worst first
-    rows = marker_rows(motion.labels, motion.residuals, None if take.soft is None else take.soft.motion.residuals,
-                       motion.trusted)
-    page.table(rows, ("marker", "fixed shape (mm)", "soft tissue (mm)", "95th percentile (mm)", "seen (%)",
-                      "believed (%)"))
-    used = np.isfinite(motion.residuals).any(axis=0)
-    unused = [label for label, is_used in zip(motion.labels, used, strict=True) if not is_used]
-    if unused:
-        page.text(f"Not used, because the layout does not know them or they were never seen: {', '.join(unused)}.")
+    page.chart(chart_residuals(take.shown), "mean of the markers, over time")
+    page.bodies(frame_panes(motion, take.subject, take.markers.positions, worst_frames(take.shown, 5)),
+                "the frames in which they are farthest", 300)
+    show_markers(page, motion, None if take.soft is None else take.soft.motion)
     if take.soft is not None:
         page.section("Soft tissue", "The skin may move in every frame, as flesh does and as a pose model with one "
                      "fixed shape cannot. What it takes up may also be markers that slide with the skin.")
-        # over 56 frames
-        frames = spread_indices(len(take.shown.poses), 56)
-        page.bodies([pictures.soft_pane(take, frames)], "where the body changes most")
+        page.bodies([pictures.soft_pane(take, take.soft)], "where the body changes most")
     page.section("Marker artefacts", "The body says where each marker should be: one that is elsewhere was "
                  "swapped with another, has slipped, jitters or strays.")
     # a table of artefacts, in order of time
@@ -117,7 +104,7 @@ def take_page(take: Take, metrics: Sequence[Metric], picture: np.ndarray, gait: 
                    ("artefact", "marker", "first frame", "last frame", "lasts (s)", "distance (mm)"))
     else:
         page.text("None was found.")
-    return page.chart(chart_timeline(take), "every marker over time")
+    return page
 
 
 def show_walk(page: Page, gait: GaitCycles | None, reactions: GroundReactions | None) -> None:
@@ -136,16 +123,10 @@ def show_walk(page: Page, gait: GaitCycles | None, reactions: GroundReactions | 
             page.text(f"{note[0].upper()}{note[1:]}.")
 
 
-def person_picture(model: BodyModel, result: MoshResult) -> np.ndarray:
-    """Render a person with the markers from four sides, for the page of all people."""
-    body = pictures.person_in_mean_pose(model, result.betas)
-    return pictures.picture_sides(body, result.layout.place(body))
-
-
 def take_picture(take: Take) -> np.ndarray:
     """Render six frames of a sequence, for the page of its person."""
     frames = np.unique(np.linspace(0, len(take.motion.poses) - 1, 8).round().astype(int)[1:-1])
-    panes = pictures.take_frame_panes(take, frames)
+    panes = frame_panes(take.motion, take.subject, take.markers.positions, frames)
     return contact_sheet([picture_pane(pane, 161, 260) for pane in panes], [pane.label for pane in panes])
 
 

@@ -53,10 +53,10 @@ from ..pose.pelvis import follow_pelvis
 from ..retargeting.retarget import retarget
 from ..retargeting.soft_tissue import picture_transfer, retarget_soft_tissue, write_character
 from .mosh import MoshConfig, MoshResult, clocks, mosh, mosh_by_sex
-from .pictures import person_in_mean_pose
+from .pictures import person_in_mean_pose, person_picture
 from .recordings import Actor, Recording
-from .report import person_page, person_picture, take_page, take_picture
-from .takes import LightMesh, Take
+from .report import person_page, take_page, take_picture
+from .takes import Take
 
 # what is left after soft tissue was fitted to the same markers is small, and no error
 FIXED = "markers to the body, fixed shape"
@@ -204,10 +204,10 @@ def _solve(work: MoshTask, actor: Actor, context: TaskContext) -> tuple[_Found, 
         result = mosh(sequences, model, usual, work.config, progress, context.step)
     # a take for each sequence
     subject = model.subject(result.betas)
-    light, takes = LightMesh.of(model.template), []
+    takes = []
     for i, (source, unit, markers) in enumerate(zip(recordings, units, sequences, strict=True)):
         soft = result.soft_tissue[i] if result.soft_tissue else None
-        takes.append(Take(source, unit, model, subject, markers, result.motions[i], soft, result.artefacts[i], light))
+        takes.append(Take(source, unit, model, subject, markers, result.motions[i], soft, result.artefacts[i]))
     segments = define_segments(work.config.angles, model, subject, result.layout)
     zero, doubts = _stand(work, subject, result.layout, segments) if work.static else (None, Judgement())
     return _Found(model, guess, result, takes, usual, layout_name, Judgement().merge(*labelling, doubts), segments,
