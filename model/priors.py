@@ -23,10 +23,6 @@ class GaussianPrior:
     mean: np.ndarray                 # (3J,), radians
     whitening: np.ndarray            # (3J-3, 3J), 1 / radians: `whitening @ (pose - mean)` has unit covariance
 
-    def energy(self, pose: np.ndarray) -> float:
-        """Compute the squared Mahalanobis distance of a pose (J, 3)."""
-        return float(((self.whitening @ (pose.ravel() - self.mean))**2).sum())
-
 
 def gaussian_prior(mean: np.ndarray, covariance: np.ndarray, shrinkage: float = SHRINKAGE) -> GaussianPrior:
     """Build the prior from mean (J, 3) and covariance (3J, 3J) of training poses.

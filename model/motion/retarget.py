@@ -34,7 +34,6 @@ class Retargeted:
     rate: float                      # frames a second
     matched: dict[str, str]          # {part of the body: joint that it follows}
     lacking: tuple[str, ...] = ()    # parts that the motion has no joint for; they follow their parent
-    scale: float = 1.0               # of the travel: ratio of the lengths of the legs
     rolls: Mapping[int, Roll] = field(default_factory=dict)      # of parts, by their hinges
 
 
@@ -160,10 +159,10 @@ class Pairing:
         return _upright(forwards, _nearest_axis(high))
 
 
-def retarget_pair(pair: Pairing, aligned: bool = False, girdle: float = 0.2, here: bool = False) -> Retargeted:
+def retarget_pair(pair: Pairing, aligned: bool = False, here: bool = False) -> Retargeted:
     """Retarget the motion of a pair's skeleton to its body; with `aligned`, the two have the same rest pose.
 
-    Where the motion has no clavicles, ours are raised by a share `girdle` of the upper arms' elevation.
+    Where the motion has no clavicles, ours are raised by a fifth of the upper arms' elevation.
     Travel is scaled as the legs are, about the origin of the file. With `here` it begins where the body stands at rest.
     """
     # rotation of every part: of the trunk, of the joint with the same role or name, else that of the parent
@@ -194,7 +193,7 @@ def retarget_pair(pair: Pairing, aligned: bool = False, girdle: float = 0.2, her
             M[:, j] = M[:, skeleton.parents[j]] if j else np.eye(3)
         if j in rolls and rolls[j].changing.any():
             M[:, j] = M[:, j] @ rotations.exp(rolls[j].changing[:, None] * rolls[j].bone)
-    # missing clavicles are raised by a share of the upper arms' angle above the horizontal
+    # missing clavicles are raised by a fifth of the upper arms' angle above the horizontal: the girdle's share there
     left, high, _ = pair.axes.T
     for side, outwards in (("l", left), ("r", -left)):
         parts = [pair.ours.get(f"{side}_{name}") for name in ("sternoclavicular", "shoulder", "elbow")]
@@ -204,7 +203,7 @@ def retarget_pair(pair: Pairing, aligned: bool = False, girdle: float = 0.2, her
         own = pair.joints[elbow] - pair.joints[arm]
         own = own / np.linalg.norm(own)
         sine = np.einsum("tab,a,tbc,c->t", np.swapaxes(M[:, clavicle], -1, -2), high, M[:, arm], own)
-        angle = girdle * np.maximum(np.arcsin(np.clip(sine, -1, 1)), 0)
+        angle = 0.2 * np.maximum(np.arcsin(np.clip(sine, -1, 1)), 0)
         M[:, clavicle] = M[:, clavicle] @ rotations.exp(angle[:, None] * np.cross(outwards, high))
     V = pair.world(aligned)
     poses = skeleton.pose_of(V @ M @ np.swapaxes(pair.P, -1, -2))
@@ -216,7 +215,7 @@ def retarget_pair(pair: Pairing, aligned: bool = False, girdle: float = 0.2, her
         place = place - place[0] + skeleton.joints[ours].mean(axis=0)
     trans = place - joint_places(skeleton, poses)[:, ours].mean(axis=1)
     trans = trans + lift(pair.vertices, poses, trans, pair.up) * pair.up
-    return Retargeted(poses, trans, moving.rate, matched, tuple(lacking), scale, rolls)
+    return Retargeted(poses, trans, moving.rate, matched, tuple(lacking), rolls)
 
 
 def lift(vertices: Vertices, poses: np.ndarray, trans: np.ndarray, up: np.ndarray) -> float:
