@@ -23,7 +23,6 @@ from scanprep.geometry import rotations
 from scanprep.geometry.files import read_mesh
 from scanprep.geometry.format_glb import turn_up
 from scanprep.pictures.camera import stance
-from scanprep.skeleton.roles import find_roles
 from scanprep.skeleton.tree import Skeleton
 
 
@@ -119,19 +118,6 @@ def test_names_of_other_programs():
         "leftFoot"], strict=True))
     with pytest.raises(ValueError, match=r"names: expected a person's parts .* found part0, part1"):
         names_of(chain("part0", "part1"), "vrm")
-
-
-@pytest.mark.parametrize("kind", ["mixamo", "vrm", "h-anim", "opensim"])
-def test_names_are_read_as_the_same_joints(kind):
-    """What we read other programs' skeletons by finds the same joints under the new names."""
-    limbs = [f"{part}_{side}" for side in ("left", "right")
-             for part in ("shoulder", "upper_arm", "forearm", "hand", "thigh", "shin", "foot")]
-    parts = chain("pelvis", "abdomen", "chest", "neck", "head", *limbs)
-    named = names_of(parts, kind)
-    assert len(set(named.values())) == len(named)
-    before, after = find_roles(parts.names), find_roles([named.get(name, name) for name in parts.names])
-    assert {role: j for role, j in after.items() if role != "vl5"} == {
-        role: j for role, j in before.items() if role != "vl5"}
 
 
 @pytest.mark.parametrize("turn", [0.0, 1.1, -2.5])

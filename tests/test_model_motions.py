@@ -25,7 +25,7 @@ from scanprep.synthetic.people import synthesise_walk
 
 @pytest.mark.parametrize(("unit", "how"), [
     ("cm", {}), ("in", {}), ("cm", {"root": "chest"}), ("m", {"names": "mixamo"}), ("mm", {"names": "h-anim"}),
-    ("cm", {"names": "vrm", "root": "chest"})])
+    ("cm", {"names": "vrm", "root": "chest"}), ("cm", {"names": "opensim"})])
 def test_our_motion_comes_back_from_bvh(tmp_path, unit, how):
     model, rng = small_people(), np.random.default_rng(0)
     poses, trans = random_poses(), rng.normal(size=(FRAMES, 3))
@@ -34,7 +34,8 @@ def test_our_motion_comes_back_from_bvh(tmp_path, unit, how):
     found = read_motion(tmp_path / "a.bvh", model)              # the unit is not said: lengths tell
     assert degrees(found.poses, poses) < 1e-4 and found.rate == pytest.approx(30)
     if "names" in how:
-        thigh = {"mixamo": "mixamorig:LeftUpLeg", "h-anim": "l_hip", "vrm": "leftUpperLeg"}[how["names"]]
+        thigh = {"mixamo": "mixamorig:LeftUpLeg", "h-anim": "l_hip", "vrm": "leftUpperLeg",
+                 "opensim": "femur_l"}[how["names"]]
         assert found.brought.matched["thigh_left"] == thigh and not found.brought.lacking
     else:
         assert np.abs(found.trans - trans).max() < 1e-6 and found.fit is None
