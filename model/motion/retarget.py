@@ -34,6 +34,7 @@ class Retargeted:
     rate: float                      # frames a second
     matched: dict[str, str]          # {part of the body: joint that it follows}
     lacking: tuple[str, ...] = ()    # parts that the motion has no joint for; they follow their parent
+    scale: float = 1.0               # of the travel: ratio of the lengths of the legs
     rolls: Mapping[int, Roll] = field(default_factory=dict)      # of parts, by their hinges
 
 
@@ -215,7 +216,7 @@ def retarget_pair(pair: Pairing, aligned: bool = False, here: bool = False) -> R
         place = place - place[0] + skeleton.joints[ours].mean(axis=0)
     trans = place - joint_places(skeleton, poses)[:, ours].mean(axis=1)
     trans = trans + lift(pair.vertices, poses, trans, pair.up) * pair.up
-    return Retargeted(poses, trans, moving.rate, matched, tuple(lacking), rolls)
+    return Retargeted(poses, trans, moving.rate, matched, tuple(lacking), scale, rolls)
 
 
 def lift(vertices: Vertices, poses: np.ndarray, trans: np.ndarray, up: np.ndarray) -> float:
