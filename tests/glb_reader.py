@@ -11,7 +11,7 @@ NUMBERS = {5126: "<f4", 5125: "<u4", 5123: "<u2", 5121: "u1"}
 
 
 class Glb:
-    """A binary glTF file of one mesh."""
+    """A binary glTF file; `primitive` and what is skinned by it are those of its first mesh."""
 
     def __init__(self, data):
         magic, version, size = struct.unpack("<4sII", data[:12])
@@ -27,10 +27,11 @@ class Glb:
     def array(self, number):
         accessor = self.json["accessors"][number]
         view = self.json["bufferViews"][accessor["bufferView"]]
-        dtype = np.dtype(NUMBERS[accessor["componentType"]])
-        assert view["byteOffset"] % 4 == 0
-        data = self.buffer[view["byteOffset"]:view["byteOffset"] + view["byteLength"]]
-        values = np.frombuffer(data, dtype).reshape(accessor["count"], WIDTH[accessor["type"]])
+        dtype, width = np.dtype(NUMBERS[accessor["componentType"]]), WIDTH[accessor["type"]]
+        start = view.get("byteOffset", 0) + accessor.get("byteOffset", 0)
+        assert start % 4 == 0
+        steps = view.get("byteStride", dtype.itemsize * width), dtype.itemsize
+        values = np.ndarray((accessor["count"], width), dtype, self.buffer, start, steps)
         if "min" in accessor:
             assert np.array_equal(values.min(axis=0), np.float32(accessor["min"]))
             assert np.array_equal(values.max(axis=0), np.float32(accessor["max"]))
@@ -41,13 +42,18 @@ class Glb:
         return self.json["meshes"][0]["primitives"][0]
 
     @property
+    def bones(self):
+        return [self.json["nodes"][number]["name"] for number in self.json["skins"][0]["joints"]]
+
+    @property
     def faces(self):
         return self.array(self.primitive["indices"]).reshape(-1, 3)
 
-    def morphed(self, weights, name="POSITION"):
+    def morphed(self, weights, name="POSITION", primitive=None):
         """An attribute with the morph targets added, double precision."""
-        out = self.array(self.primitive["attributes"][name]).astype(float)
-        for w, target in zip(weights, self.primitive.get("targets", []), strict=True):
+        primitive = primitive or self.primitive
+        out = self.array(primitive["attributes"][name]).astype(float)
+        for w, target in zip(weights, primitive.get("targets", []), strict=True):
             out += w * self.array(target[name])
         return out
 
@@ -85,17 +91,23 @@ class Glb:
             waiting += [(child, out[node]) for child in self.json["nodes"][node].get("children", [])]
         return out
 
-    def skinned(self, frame=None, weights=None):
+    def vertices(self, frame=None):
+        """Vertices (N, 3) of every primitive, without morph targets."""
+        return [self.skinned(frame, [0] * len(primitive.get("targets", [])), primitive)
+                for node in self.json["nodes"] if "mesh" in node
+                for primitive in self.json["meshes"][node["mesh"]]["primitives"]]
+
+    def skinned(self, frame=None, weights=None, primitive=None):
         """Vertices (N, 3) of the skinned mesh at rest or at a key frame, as the specification says."""
-        world = self.matrices(frame)
+        world, primitive = self.matrices(frame), primitive or self.primitive
         if weights is None:
             weights = self.moved(frame)[1]
         skin = self.json["skins"][0]
         inverse = self.array(skin["inverseBindMatrices"]).reshape(-1, 4, 4).transpose(0, 2, 1)
         carry = np.stack([world[node] for node in skin["joints"]]) @ inverse
-        attributes = self.primitive["attributes"]
+        attributes = primitive["attributes"]
         joints, shares = self.array(attributes["JOINTS_0"]), self.array(attributes["WEIGHTS_0"])
-        points = self.morphed(weights)
+        points = self.morphed(weights, primitive=primitive)
         out = np.zeros_like(points)
         for k in range(4):
             M = carry[joints[:, k]]

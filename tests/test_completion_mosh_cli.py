@@ -230,7 +230,7 @@ def test_a_page_plays_no_more_frames_than_it_can_carry(count, rate, step):
 @pytest.mark.slow
 def test_the_model_of_the_sex_that_the_markers_tell(place, tmp_path):
     model = worm_with_prior()
-    model.info["sex_plane"] = SexPlane(np.array([1.0, 0, 0]), 0.0, 40, 0.95, 5.0).to_arrays()
+    model.info["sex_plane"] = SexPlane(np.array([1.0, 0, 0]), 0.0, 40, 5.0).to_arrays()
     model.save(tmp_path / "neutral.npz")
     shutil.copytree(place / "people", tmp_path / "people", ignore=shutil.ignore_patterns("walk.csv"))
     shutil.copy(tmp_path / "neutral.npz", tmp_path / "model.npz")

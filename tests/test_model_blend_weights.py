@@ -33,11 +33,6 @@ def test_only_linked_parts_share(model):
     assert (weights[model.skeleton.part_of_face == 1][:, 2:] == 0).all()
 
 
-def test_refuses_a_width_that_is_not_positive(model):
-    with pytest.raises(ValueError, match="width"):
-        skin_weights(model.template, model.skeleton, 0.0)
-
-
 def test_blending_with_own_rotations_alone_is_scape(model):
     own = np.eye(4)[model.skeleton.part_of_face]
     blended = BlendScapeModel(model.template, model.skeleton, model.pose_space, model.shape_space, model.pose_mean,

@@ -147,14 +147,6 @@ def test_a_mesh_of_other_triangles_is_registered(drawn, tmp_path):
         register_character(model, mesh, {"left end": theirs["left end"]}, ours)
 
 
-def test_with_the_template_triangles_nothing_is_registered():
-    model = worm_model()
-    mesh = model.template.with_vertices(figure(model.template))
-    found = register_character(model, mesh)
-    assert found.registration is None and found.mesh is mesh
-    np.testing.assert_array_equal(found.model.shape_space.mean, character_model(model, mesh.vertices).shape_space.mean)
-
-
 def test_from_the_command_line(drawn, tmp_path, capsys):
     model = worm_model()
     model.save(tmp_path / "worm.npz")

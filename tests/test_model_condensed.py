@@ -41,14 +41,6 @@ def test_every_product_is_stitched(model):
 
 
 @WORMS
-def test_many_people_at_once(model):
-    rng = np.random.default_rng(0)
-    poses, betas = random_poses(model, 70, rng), rng.normal(size=(70, 2))
-    wanted = np.stack([model.vertices_of(p, b) for p, b in zip(poses, betas, strict=True)])
-    np.testing.assert_allclose(model.bodies_of(poses, betas), wanted, rtol=0, atol=1e-11)
-
-
-@WORMS
 def test_sums_sizes_and_types(model):
     rng = np.random.default_rng(0)
     pose, (one, other) = random_poses(model, 1, rng)[0], (model.operator(rng.normal(size=3)) for _ in range(2))

@@ -3,7 +3,6 @@ import json
 
 import numpy as np
 import pytest
-from conformance_bodies import KINDS
 from model_bodies import random_poses, worm_model
 
 from model import LearnConfig, learn_scape
@@ -14,7 +13,6 @@ from model.evaluation.errors import (
     shape_errors,
 )
 from model.evaluation.sampling import sample_bodies
-from model.fitting.vertices import FitConfig
 from model.posing.cli import mesh as mesh_command
 from model.scape import ScapeModel
 from model.shape_space import ShapeSpace
@@ -78,17 +76,6 @@ def test_more_components_leave_less_and_all_leave_nothing(model, people):
     assert found.converged.all() and found.vertex_pca is None
     assert (found.betas[0, :, 1:] == 0).all() and (found.betas[1, :, 2:] == 0).all()
     np.testing.assert_allclose(found.vertices(model, 2, 4), people[4], atol=1e-4)
-
-
-@pytest.mark.parametrize("kind", list(KINDS))
-def test_every_kind_of_model_is_measured(kind):
-    model, rng = KINDS[kind](), np.random.default_rng(3)
-    poses, betas = random_poses(model, 2, rng, 0.2), rng.normal(size=(2, model.n_betas))
-    assert pose_errors(model, model.vertices(poses)).errors.worst.max() < 1e-4
-    found = shape_errors(model, model.vertices(poses, betas), (1, model.n_betas), config=FitConfig(sample=100))
-    assert found.errors[-1].worst.max() < 2e-4 < 2e-3 < found.errors[0].overall
-    drawn = sample_bodies(model, 2, rng, pose_too=True)
-    np.testing.assert_allclose(drawn.vertices[1], model.vertices(drawn.poses[1], drawn.betas[1]), atol=1e-12)
 
 
 def test_vertex_pca_is_that_of_the_singular_value_decomposition(model, people):

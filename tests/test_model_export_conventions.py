@@ -10,21 +10,19 @@ from glb_reader import Glb
 from model_bodies import worm_model
 from scipy.spatial.transform import Rotation
 
-from model.export.bvh import write_bvh
 from model.export.cli import export
 from model.export.conventions import aim_bones, for_programs
 from model.export.correctives import motion_correctives
-from model.export.glb import encode_skinned_glb, write_skinned_glb
+from model.export.glb import encode_skinned_glb
 from model.export.names import names_of
 from model.posing.cli import mesh
-from model.rig import change_root, joint_places, make_rig
+from model.rig import change_root
 from model.statue.control.files import humanoid
 from scanprep.command_line import run
 from scanprep.geometry import rotations
 from scanprep.geometry.files import read_mesh
 from scanprep.geometry.format_glb import turn_up
 from scanprep.pictures.camera import stance
-from scanprep.skeleton.roles import find_roles
 from scanprep.skeleton.tree import Skeleton
 
 
@@ -122,19 +120,6 @@ def test_names_of_other_programs():
         names_of(chain("part0", "part1"), "vrm")
 
 
-@pytest.mark.parametrize("kind", ["mixamo", "vrm", "h-anim", "opensim"])
-def test_names_are_read_as_the_same_joints(kind):
-    """What we read other programs' skeletons by finds the same joints under the new names."""
-    limbs = [f"{part}_{side}" for side in ("left", "right")
-             for part in ("shoulder", "upper_arm", "forearm", "hand", "thigh", "shin", "foot")]
-    parts = chain("pelvis", "abdomen", "chest", "neck", "head", *limbs)
-    named = names_of(parts, kind)
-    assert len(set(named.values())) == len(named)
-    before, after = find_roles(parts.names), find_roles([named.get(name, name) for name in parts.names])
-    assert {role: j for role, j in after.items() if role != "vl5"} == {
-        role: j for role, j in before.items() if role != "vl5"}
-
-
 @pytest.mark.parametrize("turn", [0.0, 1.1, -2.5])
 def test_soles_on_the_ground_and_face_to_the_viewer(person, turn):
     """However it stood before: z up and -y to the viewer, which is y up and +z in GLB."""
@@ -211,27 +196,3 @@ def test_a_mesh_stands_on_the_ground_and_looks_at_the_viewer(files, model, name)
     turn = Rotation.align_vectors(body.vertices - body.vertices.mean(axis=0), own - own.mean(axis=0))[0]
     ahead = turn.apply(stance(model.template, vertical=np.eye(3)[up])[1])
     assert ahead @ turn_up(up).T @ [0, 0, 1] == pytest.approx(1, abs=1e-9)
-
-
-def test_blender_shows_the_same(tmp_path):
-    """The whole motion of surface and joints, with correctives, other root, other names."""
-    pytest.importorskip("bpy", reason="Blender as a module (pip install bpy)")
-    from blender_reader import evaluated
-
-    poses, trans = swaying(theirs := make_rig(worm_model(), np.array([0.5, -1.0]), 2))
-    subject = worm_model().subject(np.array([0.5, -1.0]))
-    made = replace(theirs, correctives=motion_correctives(theirs, subject, poses))
-    made, turns, places = for_programs(made, poses, trans, 2, "part2")
-    write_skinned_glb(tmp_path / "a.glb", made, turns, places, 4.0)
-    write_bvh(tmp_path / "a.bvh", made.skeleton, turns, places, 4.0, body=made.mesh)
-    times, U = np.arange(6) / 4, turn_up(2).T
-    off = np.linalg.norm(evaluated(tmp_path / "a.glb", times) - subject.vertices(poses, trans) @ U, axis=2)
-    assert off.mean() < 1e-3 and np.linalg.norm(rig_off(theirs, subject, poses), axis=2).mean() > 3 * off.mean()
-    shown = evaluated(tmp_path / "a.glb", times, made.skeleton.names)
-    joints = joint_places(made.skeleton, turns, places) @ U
-    assert np.abs(shown - joints).max() < 1e-5
-    assert np.abs(evaluated(tmp_path / "a.bvh", times, made.skeleton.names) - joints).max() < 1e-4
-
-
-def rig_off(rig, subject, poses):
-    return rig.vertices(poses) - subject.vertices(poses)

@@ -9,7 +9,7 @@ from conformance_bodies import blendscape_worm, scape_worm, skinned_worm
 from exported_worms import BETAS, worm, worm_motion, worm_rig  # noqa: F401 -- fixtures
 from glb_reader import Glb
 
-from model.export.cli import export, read_motion
+from model.export.cli import export
 from model.export.correctives import motion_correctives, write_body_npz
 from model.export.glb import continuous_quaternions, encode_skinned_glb, write_skinned_glb
 from model.motion.onto import BodyMotion
@@ -19,7 +19,6 @@ from scanprep.command_line import run
 from scanprep.geometry import rotations
 from scanprep.geometry.files import read_mesh
 from scanprep.geometry.mesh import Mesh
-from scanprep.geometry.storage import StorageError
 
 
 @pytest.mark.parametrize("up", [0, 1, 2])
@@ -219,21 +218,6 @@ def test_a_motion_at_another_rate_is_the_same_motion(rate):
     assert found.rate == rate and len(found.poses) == int(rate) + 1
     np.testing.assert_allclose(rotations.exp(found.poses), rotations.exp(wanted.poses), atol=1e-9)
     np.testing.assert_allclose(found.trans, wanted.trans, atol=1e-12)
-
-
-@pytest.mark.parametrize(("change", "words"), [
-    ({"poses": np.zeros((2, 15))}, "4 parts"), ({"betas": np.ones(7)}, "at most the 3 betas"),
-    ({"poses": np.zeros((0, 12))}, "4 parts"), ({"trans": np.zeros((3, 3))}, r"trans: expected shape \(2, 3\)"),
-    ({"surface_model_type": np.array("other")}, "surface_model_type 'scape'"),
-    ({"mocap_frame_rate": np.array(0.0)}, "rate"), ({}, None)])
-def test_motions_of_other_bodies_are_refused(model, tmp_path, change, words):
-    rate = {"mocap_frame_rate" if words else "mocap_framerate": np.array(30.0)}
-    np.savez(tmp_path / "m.npz", **{"poses": np.zeros((2, 12)), "trans": np.zeros((2, 3)), **rate, **change})
-    if words is None:
-        assert read_motion(tmp_path / "m.npz", model).rate == 30.0
-        return
-    with pytest.raises(StorageError, match=words):
-        read_motion(tmp_path / "m.npz", model)
 
 
 @pytest.mark.parametrize("betas", [0, 3])

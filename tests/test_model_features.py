@@ -49,15 +49,6 @@ def test_batch_is_the_loop_and_the_first_feature_of_a_part_is_one(lift):
     assert features.starts.tolist() == [0, 3, 6, 9]
 
 
-@pytest.mark.parametrize("lift", lifts(), ids=lambda lift: lift.kind)
-def test_lift_comes_back_from_its_arrays(lift):
-    t = np.random.default_rng(4).normal(size=(2, 4, 3))
-    features = features_of(lift)
-    arrays = {"feature_part": features.part, "feature_mix": features.mix}
-    again = restore_features(features.skeleton, {"lift": lift.kind}, arrays).lift
-    np.testing.assert_array_equal(again.evaluate(t), lift.evaluate(t))
-
-
 def test_quadratic_lift_has_all_products():
     value = QuadraticLift().evaluate(np.array([[1.0, 2.0, 5.0]]))[0]
     assert value.tolist() == [1, 2, 5, 1, 2, 5, 4, 10, 25]

@@ -12,19 +12,6 @@ def model():
     return worm_model()
 
 
-@pytest.mark.parametrize("sample", [60, 10**6])
-def test_pose_of_the_models_own_bodies(model, sample):
-    rng = np.random.default_rng(0)
-    subject = model.subject([0.5, -0.5, 1.0])
-    for pose in random_poses(model, 6, rng, 0.6):
-        trans = rng.normal(size=3)
-        truth = subject.vertices(pose, trans)
-        fit = fit_pose(subject, truth, FitConfig(sample=sample))
-        assert fit.converged and fit.rms < 1e-6 and fit.mean <= fit.rms
-        np.testing.assert_allclose(rotations.exp(fit.pose), rotations.exp(pose), atol=1e-4)
-        np.testing.assert_allclose(fit.trans, trans, atol=1e-5)
-
-
 def test_pose_follows_a_rigid_motion_of_the_data(model):
     rng = np.random.default_rng(1)
     subject = model.subject()

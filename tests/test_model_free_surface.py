@@ -1,22 +1,14 @@
 import numpy as np
-import pytest
 from completion_bodies import worm_with_prior
 from scipy.sparse import csr_array
 
 from model.fitting.free_surface import FreeSurface
 from model.gradients import edges
 
-RNG = np.random.default_rng(0)
 
-
-@pytest.fixture(scope="module")
-def body():
-    return worm_with_prior()
-
-
-def test_the_free_surface_minimises_equation_10(body):
+def test_the_free_surface_minimises_equation_10():
     """Against the dense least squares over all edges with R, S and Q spelled out."""
-    rng = np.random.default_rng(1)
+    rng, body = np.random.default_rng(1), worm_with_prior()
     pose, betas = rng.normal(0, 0.4, (4, 3)), np.array([0.5, -1, 0.2])
     predicted = body.vertices(pose, betas)
     faces, n = body.template.faces, len(predicted)

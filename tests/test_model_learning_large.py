@@ -46,15 +46,6 @@ def test_a_large_set_is_learned_on_fewer_vertices_and_said(bodies, tmp_path, sma
     assert was_trained_on(model, np.stack([body.vertices for body in bodies]).astype(np.float32)).all()
 
 
-def test_a_given_skeleton_is_brought_to_fewer_vertices(truth, bodies, small_limit):
-    sizes = Resolutions(bodies[0])
-    assert len(sizes.learned.vertices) < len(bodies[0].vertices)
-    reduced = sizes.reduce(np.stack([body.vertices for body in bodies]))
-    # the surface is where it was
-    near = sizes.learned.with_vertices(reduced[3]).corners.mean(axis=(0, 1))
-    np.testing.assert_allclose(near, bodies[3].corners.mean(axis=(0, 1)), atol=0.02)
-
-
 def test_small_bodies_are_learned_as_they_are(bodies):
     sizes, posed = Resolutions(bodies[0]), np.stack([body.vertices for body in bodies])
     assert sizes.learned is bodies[0] and sizes.reduce(posed) is posed

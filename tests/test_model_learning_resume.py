@@ -1,6 +1,9 @@
 """`scape learn` killed, started again, and with inputs that change: nothing lost, nothing stale, nothing done twice."""
+import os
+import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import numpy as np
@@ -8,37 +11,15 @@ import pytest
 from config_files import config_file
 from model_bodies import random_poses, worm_model
 
+from completion.__main__ import main
 from model import report
-from model.learning import body, cli, scape
-from model.learning.cli import learn
+from model.learning import body
 from model.learning.parts import ChosenSkeleton
 from scanprep import read_mesh, write_mesh
 from scanprep.batch.opening import beside
-from scanprep.command_line import run
 
-STAGES = {"skeleton": (body, "choose_skeleton"), "poses": (scape, "by_edges"), "people": (scape, "shape_gradients"),
-          "components": (scape, "learn_shape_space"), "pictures": (cli, "_draw")}
 QUICK = {"refinements": 1, "components": 4, "prunings": [0.01], "ridges": [1e-3]}
-SKIN = {"rounds": 2, "components": 4}
-ALL = {"skeleton": 1, "poses": 1, "people": 6, "components": 1, "pictures": 1}
-
-KILLED = """
-import os, sys
-import {package} as module
-from model.learning.cli import learn
-from scanprep.command_line import run
-
-real, calls = module.{name}, []
-
-def dying(*given, **named):
-    calls.append(1)
-    if len(calls) > {after}:
-        os.kill(os.getpid(), 9)
-    return real(*given, **named)
-
-module.{name} = dying
-run(learn, "scape learn", sys.argv[1:])
-"""
+STEPS = {"skeleton", "pose space", "shape components"}
 
 
 @pytest.fixture(autouse=True)
@@ -57,26 +38,10 @@ def bodies(tmp_path):
     for i, vertices in enumerate(truth.subject().vertices(poses)):
         write_mesh(tmp_path / "poses" / f"pose{i}.ply", truth.template.with_vertices(vertices))
     for i in range(6):
-        body = truth.vertices(random_poses(truth, 1, rng, 0.1)[0], rng.normal(size=3))
-        write_mesh(tmp_path / "people" / f"person{i}.ply", truth.template.with_vertices(body))
+        person = truth.vertices(random_poses(truth, 1, rng, 0.1)[0], rng.normal(size=3))
+        write_mesh(tmp_path / "people" / f"person{i}.ply", truth.template.with_vertices(person))
     truth.skeleton.save(tmp_path / "skeleton.json")
     return tmp_path
-
-
-@pytest.fixture
-def counted(monkeypatch):
-    """Calls of the stages."""
-    calls = dict.fromkeys(STAGES, 0)
-
-    def count(stage, real):
-        def counting(*given, **named):
-            calls[stage] += 1
-            return real(*given, **named)
-        return counting
-
-    for stage, (module, name) in STAGES.items():
-        monkeypatch.setattr(module, name, count(stage, getattr(module, name)))
-    return calls
 
 
 @pytest.fixture
@@ -87,97 +52,73 @@ def searched(monkeypatch):
 
 
 def words(bodies, output, *more, search=False, **settings):
-    file = config_file(bodies, scape={**QUICK, **settings}, skinning=SKIN)
     known = [] if search else ["--skeleton", str(bodies / "skeleton.json")]
-    return ["--poses", str(bodies / "poses"), "--shapes", str(bodies / "people"), "-o", str(bodies / output),
-            "--config", str(file), *known, *map(str, more)]
+    return ["learn", "--poses", str(bodies / "poses"), "--shapes", str(bodies / "people"), "-o", str(bodies / output),
+            "--config", str(config_file(bodies, scape={**QUICK, **settings})), *known, *map(str, more)]
 
 
-def learned(bodies, output, *more, search=False, **settings):
+def learned(bodies, output, *more, **how):
     """The bytes of the model."""
-    assert run(learn, "scape learn", words(bodies, output, *more, search=search, **settings)) == 0
+    assert main(words(bodies, output, *more, **how)) == 0
     return (bodies / output).read_bytes()
 
 
-def killed(module, name, after, argv):
-    script = KILLED.format(package=module.__name__, name=name, after=after)
-    ended = subprocess.run([sys.executable, "-c", script, *argv], capture_output=True, check=False,
-                           cwd=Path(__file__).parents[1])
-    assert ended.returncode == -9, ended.stderr.decode()
-
-
-def moved(path):
-    mesh = read_mesh(path)
-    write_mesh(path, mesh.with_vertices(mesh.vertices * [1, 1, 1.01]))
-
-
-def anew(counted, since):
-    """What was done since the calls were copied."""
-    return {stage: calls - since[stage] for stage, calls in counted.items() if calls > since[stage]}
+def made(bodies, output):
+    """When each step that is kept was made."""
+    return {path.stem: path.stat().st_mtime_ns for path in (bodies / f".{output}.scapekit" / "done").glob("*.npz")}
 
 
 @pytest.mark.slow
-def test_killed_and_started_again_it_goes_on_and_ends_with_the_same_bytes(bodies, counted):
+def test_killed_and_started_again_it_goes_on_and_ends_with_the_same_bytes(bodies):
     undisturbed = learned(bodies, "a.npz")
-    assert counted == {**ALL, "skeleton": 0}
-    since = dict(counted)
-    killed(scape, "shape_gradients", 4, words(bodies, "b.npz"))
-    assert not (bodies / "b.npz").exists()
-    assert learned(bodies, "b.npz") == undisturbed
-    assert anew(counted, since) == {"people": 2, "components": 1, "pictures": 1}
-    assert sorted(p.name for p in bodies.glob(".b.npz.scapekit/done/*")) == [
-        "pose space.npz", "shape components.npz"]            # what later ones are made of has gone
+    child = subprocess.Popen([sys.executable, "-m", "completion", *words(bodies, "b.npz")], stderr=subprocess.DEVNULL,
+                             cwd=Path(__file__).parents[1])
+    deadline = time.monotonic() + 120
+    while "pose space" not in made(bodies, "b.npz"):
+        assert child.poll() is None and time.monotonic() < deadline
+        time.sleep(0.005)
+    os.kill(child.pid, signal.SIGKILL)
+    child.wait()
+    before = made(bodies, "b.npz")
+    assert not (bodies / "b.npz").exists() and learned(bodies, "b.npz") == undisturbed
+    after = made(bodies, "b.npz")                              # what later steps are made of has gone
+    assert after.keys() == {"pose space", "shape components"} and after["pose space"] == before["pose space"]
     assert not list(bodies.glob(".b.npz.scapekit/making/*")) and not list(bodies.glob(".*.part*"))
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("more, done", [
-    ([], {"pictures": 1}),
-    (["--landmarks"], {"pictures": 1}),
-    ({"components": 2}, {"people": 6, "components": 1, "pictures": 1}),
-    ({"refinements": 2}, {"poses": 1, "people": 6, "components": 1, "pictures": 1}),
-    ({"search": False}, {"pictures": 1}),              # the skeleton that was found is given: nothing follows from it
-    (["--force"], ALL)])
-def test_a_setting_that_changes(bodies, searched, counted, more, done):
+@pytest.mark.parametrize("change, kept", [
+    (["--landmarks", "marks.json"], STEPS), ({"components": 2}, {"skeleton", "pose space"}),
+    ({"refinements": 2}, {"skeleton"}), (["--force"], set()), ("poses/pose3.ply", set()),
+    ("people/person3.ply", {"skeleton", "pose space"})])
+def test_only_what_depends_on_a_change_is_made_anew(bodies, searched, monkeypatch, change, kept):
+    monkeypatch.chdir(bodies)
+    (bodies / "marks.json").write_text('{"nose": 3}')
     learned(bodies, "m.npz", search=True)
-    since = dict(counted)
-    if "--landmarks" in more:
-        (bodies / "marks.json").write_text('{"nose": 3}')
-        more = ["--landmarks", bodies / "marks.json"]
-    settings, more = (more, []) if isinstance(more, dict) else ({}, more)
-    settings = {"search": True, **settings}
-    found = learned(bodies, "m.npz", *more, **settings)
-    assert anew(counted, since) == done
-    assert found == learned(bodies, "fresh.npz", *more, **settings)
+    before = made(bodies, "m.npz")
+    if isinstance(change, str):
+        mesh = read_mesh(bodies / change)
+        write_mesh(bodies / change, mesh.with_vertices(mesh.vertices * [1, 1, 1.01]))
+    more, settings = change if isinstance(change, list) else [], change if isinstance(change, dict) else {}
+    found = learned(bodies, "m.npz", *more, search=True, **settings)
+    assert {step for step, time in made(bodies, "m.npz").items() if before[step] == time} == kept
+    assert found == learned(bodies, "fresh.npz", *more, search=True, **settings)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("file, done", [
-    ("poses/pose3.ply", ALL), ("people/person3.ply", {"people": 6, "components": 1, "pictures": 1})])
-def test_a_mesh_that_changes(bodies, searched, counted, file, done):
-    learned(bodies, "m.npz", search=True)
-    since = dict(counted)
-    moved(bodies / file)
-    found = learned(bodies, "m.npz", search=True)
-    assert anew(counted, since) == done
-    assert found == learned(bodies, "fresh.npz", search=True)
-
-
-@pytest.mark.parametrize("step", ["skeleton", "pose space", "shape components"])
-def test_a_damaged_step_is_made_anew(bodies, searched, counted, step):
-    undisturbed, since = learned(bodies, "m.npz", search=True), dict(counted)
+@pytest.mark.parametrize("step", sorted(STEPS))
+def test_a_damaged_step_is_made_anew(bodies, searched, step):
+    undisturbed = learned(bodies, "m.npz", search=True)
     path = bodies / ".m.npz.scapekit/done" / f"{step}.npz"
     data = bytearray(path.read_bytes())
     data[len(data) // 2] ^= 255
     path.write_bytes(data)
     assert learned(bodies, "m.npz", search=True) == undisturbed
-    assert set(anew(counted, since)) >= {{"skeleton": "skeleton", "pose space": "poses"}.get(step, "components")}
 
 
 def test_what_is_not_ours_stays(bodies, capsys):
     for name in ("m.npz", "m.parts.png"):
         (bodies / name).write_text("mine")
-        assert run(learn, "scape learn", words(bodies, "m.npz")) == 1
+        assert main(words(bodies, "m.npz")) == 1
         assert name in capsys.readouterr().err and (bodies / name).read_text() == "mine"
         assert not (bodies / "m.npz.report.json").exists()
         (bodies / name).unlink()
@@ -185,18 +126,18 @@ def test_what_is_not_ours_stays(bodies, capsys):
 
 
 def test_pictures_of_another_run_go_and_come(bodies):
+    both = {"m.parts.png", "m.components.png"}
     learned(bodies, "m.npz")
-    assert {p.name for p in bodies.glob("*.png")} == {"m.parts.png", "m.components.png"}
-    given = words(bodies, "m.npz")
-    del given[given.index("--shapes"):given.index("--shapes") + 2]
-    assert run(learn, "scape learn", given) == 0
-    assert {p.name for p in bodies.glob("*.png")} == {"m.parts.png"}
+    assert {p.name for p in bodies.glob("*.png")} == both
+    without = words(bodies, "m.npz")
+    del without[without.index("--shapes"):without.index("--shapes") + 2]
+    assert main(without) == 0 and {p.name for p in bodies.glob("*.png")} == {"m.parts.png"}
     learned(bodies, "m.npz", components=2)
-    assert {p.name for p in bodies.glob("*.png")} == {"m.parts.png", "m.components.png"}
+    assert {p.name for p in bodies.glob("*.png")} == both
 
 
 def test_a_second_run_on_one_output_leaves(bodies, capsys):
     with beside(bodies / "m.npz"):
-        assert run(learn, "scape learn", words(bodies, "m.npz")) == 1
+        assert main(words(bodies, "m.npz")) == 1
     assert "another run" in capsys.readouterr().err
     learned(bodies, "m.npz")

@@ -4,9 +4,7 @@ import math
 import numpy as np
 import pytest
 import trimesh
-from cartoons import cartoon
 from derivatives import slope
-from implicit_surface import project
 from people_bodies import small_people
 from scipy.spatial import ConvexHull
 from scipy.stats import norm
@@ -128,48 +126,6 @@ def test_a_way_ends_at_the_girth_wherever_the_vertices_lie(tapes, name, girth):
         normal = UP if ring.axis is None else direction(ring.axis, body.vertices)
         assert (end - origin) @ normal == pytest.approx(0, abs=1e-9)
         assert way.value == pytest.approx(np.linalg.norm(np.diff(way.curve, axis=0), axis=1).sum(), abs=2e-3)
-
-
-@pytest.mark.slow
-def test_girths_are_those_of_the_surface_itself():
-    """An implicit surface, cut without any triangles; plain polygons are 1.2 mm too short."""
-    figure, corners = cartoon("beanpole", 0.006), []
-    mesh = figure.mesh.with_vertices(project(figure.field, figure.mesh.vertices))
-    tapes = find_tapes(mesh, {name: int(np.linalg.norm(mesh.vertices - place, axis=1).argmin())
-                              for name, place in figure.landmarks.items()})
-    found = measure(mesh, tapes, tapes.axes)
-    for name in ("waist_girth", "hip_girth", "thigh_girth_left", "knee_girth_left", "calf_girth_right",
-                 "upper_arm_girth_left", "wrist_girth_left"):
-        girth = tapes.found[name]
-        normal = UP if girth.axis is None else direction(girth.axis, mesh.vertices)
-        origin = girth.centre.at(mesh.vertices)
-        origin = origin + (girth.height.at(mesh.vertices) - origin) @ normal * normal
-        heights = [origin[2]] if girth.between is None else np.linspace(
-            *(end.at(mesh.vertices)[2] for end in girth.between), 13)           # hips are the widest of 13 sections
-        true, height = max((around_field(figure.field, origin + (z - origin[2]) * UP * (len(heights) > 1), normal), z)
-                           for z in heights)
-        origin[2] = height
-        assert found.values[name] == pytest.approx(true, abs=0.001), name
-        cuts = [c.at(mesh.vertices) for c in section(mesh.vertices, girth.faces, origin, normal)]
-        mine = min(cuts, key=lambda points: np.linalg.norm(points.mean(axis=0) - origin))
-        corners.append(true - ConvexHull(mine @ np.linalg.svd(normal[None])[2][1:].T).area)
-    assert np.mean(corners) > 0.001
-
-
-def around_field(field, origin, normal):
-    """Tape (metres) around a part of an implicit surface, which is seen from a point inside in all directions."""
-    across, angle = np.linalg.svd(normal[None])[2][1:], 2 * np.pi * np.arange(240) / 240
-    ways = np.stack([np.cos(angle), np.sin(angle)], axis=1) @ across
-    inside = np.sign(field(origin[None]))
-    steps = np.arange(0.005, 0.3, 0.005)
-    out = np.sign(field((origin + steps[:, None, None] * ways).reshape(-1, 3))).reshape(len(steps), -1) != inside
-    low = steps[out.argmax(axis=0)] - 0.005
-    high = low + 0.005
-    for _ in range(12):
-        middle = 0.5 * (low + high)
-        within = np.sign(field(origin + middle[:, None] * ways)) == inside
-        low, high = np.where(within, middle, low), np.where(within, high, middle)
-    return ConvexHull(low[:, None] * np.stack([np.cos(angle), np.sin(angle)], axis=1)).area
 
 
 def test_place_turn_and_size_change_nothing_else(person, tapes):
@@ -361,8 +317,3 @@ def test_chests_as_high_as_the_armpits(built_in):
     for betas in draw_betas(model, 40, np.random.default_rng(1), "female")[0] - people.mean:
         found = measure(base + moves @ betas, tapes, tapes.axes, only=["chest_girth"]).values["chest_girth"]
         assert found == pytest.approx(usual.value + usual.along(moves) @ betas, abs=0.08)
-
-
-def test_a_sex_that_a_model_does_not_know(small_tapes):
-    with pytest.raises(ValueError, match="sex: the model does not tell women from men, so it has no women"):
-        body_with_measurements(small_people(), small_tapes, {"stature": 1.7}, "female")

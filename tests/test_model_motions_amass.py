@@ -109,6 +109,7 @@ GOOD = {"poses": np.zeros((2, 48)), "trans": np.zeros((2, 3)), "mocap_frame_rate
 @pytest.mark.parametrize(("change", "words"), [
     ({"poses": np.array([None, 1], dtype=object)}, r"array poses: expected numbers or text, found Python objects"),
     ({"mocap_frame_rate": np.array([30.0, 60.0])}, "mocap_frame_rate: expected one number"),
+    ({"mocap_frame_rate": np.array(0.0)}, "mocap_frame_rate"),
     ({"poses": np.full((2, 48), np.nan)}, "poses: 96 values are not finite"),
     ({"poses": np.zeros((0, 48)), "trans": np.zeros((0, 3))}, "frames of the model's 16 parts"),
     ({"poses": np.zeros((2, 60))}, "frames of the model's 16 parts, found 20 parts"),

@@ -9,7 +9,7 @@ from model import BodyModel, load_model
 from model.cli import group
 from model.features import linear_features
 from model.pose_space import PoseSpace
-from model.resolution.change import change_resolution, resample, resolution_gap, subdivide_at_middles
+from model.resolution.change import change_resolution, resolution_gap, subdivide_at_middles
 from model.scape import ScapeModel
 from model.shape_space import ShapeSpace
 from scanprep import decimate, write_mesh
@@ -108,13 +108,6 @@ def test_refuses_what_cannot_be(model):
         change_resolution(model, Mesh(model.template.vertices, model.template.faces[:0]))
     with pytest.raises(ValueError, match="kind 'scape'"):
         BodyModel.resample(model, model.template, model.skeleton, 0, print)
-
-
-def test_resample_reaches_the_count(model):
-    for count in (200, 700, 2000):
-        changed = resample(model.template, count)
-        assert abs(len(changed.vertices) - count) <= 2
-        assert changed.is_closed
 
 
 def test_skinning_models_are_carried_too():

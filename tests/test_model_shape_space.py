@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from model.shape_space import ShapeSpace, learn_shape_space
+from model.shape_space import learn_shape_space
 
 
 @pytest.fixture(scope="module")
@@ -62,8 +62,3 @@ def test_never_more_components_than_people_allow():
 def test_refuses_bad_betas(people, betas):
     with pytest.raises(ValueError, match="betas"):
         learn_shape_space(people[0], 3).gradients(betas)
-
-
-def test_empty_space_knows_only_the_template():
-    space = ShapeSpace.empty(7)
-    np.testing.assert_array_equal(space.gradients(None), space.gradients(np.zeros(0)))

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from glb_motion import SkinnedFile
+from glb_reader import Glb
 from PIL import Image
 from trimesh.remesh import subdivide_to_size
 
@@ -81,7 +81,7 @@ def test_the_surface_comes_back_and_the_missing_arm_is_a_hole(made, person):
 
 
 def test_the_mesh_of_the_file_hangs_on_the_skeleton_in_metres(made):
-    own, statue = SkinnedFile(made / "statue" / "own.glb"), load_statue(made / "statue")
+    own, statue = Glb((made / "statue" / "own.glb").read_bytes()), load_statue(made / "statue")
     scan = read_mesh(made / "scan.ply", "mm").vertices @ turn_up(statue.upright_axis).T
     np.testing.assert_allclose(np.concatenate(own.vertices()), scan, atol=1e-5)
     assert own.bones[:3] == ["Hips", "Spine", "Head"]

@@ -53,39 +53,6 @@ def changed(path, change):
     return out
 
 
-def with_uv(path, chart, mesh):
-    """The GLB file of the mesh with the chart as texture coordinates, its vertices repeated along the seams."""
-    vertex = np.zeros(len(chart.uv), dtype=int)
-    vertex[chart.faces.ravel()] = mesh.faces.ravel()
-
-    def change(tree, rest):
-        views, accessors = tree["bufferViews"], tree["accessors"]
-        primitive = tree["meshes"][0]["primitives"][0]
-
-        def add(values, like, kind, component):
-            rest.extend(b"\0" * (-(len(rest) - 8) % 4))
-            views.append({"buffer": 0, "byteOffset": len(rest) - 8, "byteLength": values.nbytes})
-            rest.extend(values.tobytes())
-            accessors.append({"bufferView": len(views) - 1, "componentType": component, "count": len(values),
-                              "type": kind})
-            return len(accessors) - 1
-
-        for name, number in list(primitive["attributes"].items()):
-            entry = accessors[number]
-            view, width = views[entry["bufferView"]], {"VEC3": 3, "VEC4": 4}[entry["type"]]
-            dtype = {5126: "<f4", 5121: "u1"}[entry["componentType"]]
-            values = np.frombuffer(bytes(rest), dtype, entry["count"] * width, 8 + view["byteOffset"])
-            primitive["attributes"][name] = add(values.reshape(-1, width)[vertex], name, entry["type"],
-                                                entry["componentType"])
-        uv = (chart.uv * [1, -1] + [0, 1]).astype("<f4")
-        primitive["attributes"]["TEXCOORD_0"] = add(uv, "uv", "VEC2", 5126)
-        primitive["indices"] = add(chart.faces.astype("<u4").reshape(-1, 1), "indices", "SCALAR", 5125)
-        tree["buffers"][0]["byteLength"] = len(rest) - 8
-        struct.pack_into("<I", rest, 0, len(rest) - 8)
-
-    return changed(path, change)
-
-
 def test_the_humanoid_is_one_closed_symmetric_surface_of_even_triangles():
     mesh = humanoid().mesh
     assert 950 <= len(mesh.vertices) <= 1150
@@ -204,15 +171,18 @@ def test_files_give_back_what_was_saved(tmp_path):
         read_control(tmp_path / "c.npz")
 
 
-def test_a_skinned_glb_becomes_the_same_control_model(glb):
-    control = humanoid()
-    again = read_control(with_uv(glb, control.chart, control.mesh))
+def test_a_skinned_glb_becomes_the_same_control_model(tmp_path):
+    """Of triangles that share no vertices."""
+    control, corners = humanoid(), humanoid().mesh.faces.ravel()
+    soup = Mesh(control.mesh.vertices[corners], np.arange(len(corners)).reshape(-1, 3))
+    write_skinned_glb(tmp_path / "a.glb", replace(control.rig, mesh=soup, weights=control.weights[corners],
+                                                  shapes=np.zeros((0, len(corners), 3))))
+    again = read_control(tmp_path / "a.glb")
     np.testing.assert_allclose(again.skeleton.joints, control.skeleton.joints, atol=1e-6)
     assert again.skeleton.names == NAMES == again.segments and again.landmarks == {}
     np.testing.assert_array_equal(again.skeleton.parents, control.skeleton.parents)
     assert len(again.mesh.vertices) == len(control.mesh.vertices)
-    np.testing.assert_allclose(again.mesh.corners, control.mesh.corners, atol=1e-6)      # welded, triangles in order
-    np.testing.assert_allclose(again.chart.uv[again.chart.faces], control.chart.uv[control.chart.faces], atol=1e-6)
+    np.testing.assert_allclose(again.mesh.corners, control.mesh.corners, atol=1e-6)      # triangles in order
     np.testing.assert_allclose(again.weights[again.mesh.faces], control.weights[control.mesh.faces], atol=1e-6)
     pose = 0.3 * np.random.default_rng(3).normal(size=(17, 3))
     np.testing.assert_allclose(again.rig.vertices(pose)[again.mesh.faces],

@@ -62,7 +62,8 @@ def test_a_motion_of_its_own_parts(tmp_path):
     assert np.abs(skinned - body.vertices(stored.poses, None, stored.trans)).max() < 1e-9
     assert np.linalg.norm(stored.trans - motion.trans, axis=1).max() > 1e-3, "the middle of the root part moves"
     good = dict(np.load(tmp_path / "a.npz"))
-    for change, words in (({"poses": np.zeros((4, 48))}, "part_parents"), ({"trans": np.zeros((3, 3))}, "trans"),
+    for change, words in (({"part_parents": good["part_parents"][::-1]}, r"b\.npz.*parents"),
+                          ({"poses": np.zeros((4, 48))}, "part_parents"), ({"trans": np.zeros((3, 3))}, "trans"),
                           ({"trans": good["trans"] * np.nan}, "finite"), ({"mocap_frame_rate": np.array(0.0)}, "rate")):
         np.savez(tmp_path / "b.npz", **{**good, **change})
         with pytest.raises(StorageError, match=words):
@@ -188,15 +189,6 @@ def test_a_motion_of_a_model_with_other_parts_in_another_order_is_told_by_its_na
     motion.save(tmp_path / "silent.npz")
     with pytest.raises(StorageError, match=r"does not say which skeleton its 16 parts are of.*scape animate.*BVH"):
         read_statue_motion(statue_of(humanoid()), tmp_path / "silent.npz")
-
-
-def test_a_damaged_skeleton_in_a_motion_is_named(tmp_path):
-    control = humanoid()
-    write_body_motion(tmp_path / "a.npz", control, people_motion(control, GENERIC, *synthesise_walk(3, 12), 12.0))
-    arrays = dict(np.load(tmp_path / "a.npz"))
-    np.savez(tmp_path / "b.npz", **{**arrays, "part_parents": arrays["part_parents"][::-1]})
-    with pytest.raises(StorageError, match=r"b\.npz.*parents"):
-        read_statue_motion(statue_of(control), tmp_path / "b.npz")
 
 
 def test_key_poses_move_a_statue_from_the_command_line(tmp_path, capsys):

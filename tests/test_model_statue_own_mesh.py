@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import trimesh
-from glb_motion import SkinnedFile
+from glb_reader import Glb
 from PIL import Image
 from quiet_pictures import small_pictures  # noqa: F401 -- fixture
 from scipy.spatial import cKDTree
@@ -82,9 +82,9 @@ def in_file_axes(statue):
 
 def places_of(file):
     """Vertices of a file without a skin, all of whose nodes are turned alike."""
-    plain = SkinnedFile(file)
+    plain = Glb(file.read_bytes())
     return trimesh.transform_points(np.concatenate([
-        plain.array(mesh["primitives"][0]["attributes"]["POSITION"]) for mesh in plain.tree["meshes"]]), TURN)
+        plain.array(mesh["primitives"][0]["attributes"]["POSITION"]) for mesh in plain.json["meshes"]]), TURN)
 
 
 def off(found, wanted):
@@ -92,15 +92,15 @@ def off(found, wanted):
 
 
 def test_vertices_stand_where_they_stood_and_materials_stay(file, written):
-    before, (path, _) = SkinnedFile(file), written
-    after = SkinnedFile(path)
+    before, (path, _) = Glb(file.read_bytes()), written
+    after = Glb(path.read_bytes())
     assert off(np.concatenate(after.vertices()), places_of(file)) < 1e-5 * HEIGHT
-    assert after.tree["materials"] == before.tree["materials"] and after.tree["textures"] == before.tree["textures"]
-    view = [one.tree["bufferViews"][one.tree["images"][0]["bufferView"]] for one in (before, after)]
+    assert after.json["materials"] == before.json["materials"] and after.json["textures"] == before.json["textures"]
+    view = [one.json["bufferViews"][one.json["images"][0]["bufferView"]] for one in (before, after)]
     pictures = [one.buffer[v.get("byteOffset", 0):v.get("byteOffset", 0) + v["byteLength"]]
                 for one, v in zip((before, after), view, strict=True)]
     assert pictures[0] == pictures[1]
-    old, new = (one.tree["meshes"][0]["primitives"][0] for one in (before, after))
+    old, new = (one.json["meshes"][0]["primitives"][0] for one in (before, after))
     assert old["material"] == new["material"]
     np.testing.assert_array_equal(before.array(old["attributes"]["TEXCOORD_0"]), after.array(
         new["attributes"]["TEXCOORD_0"]))
@@ -115,7 +115,7 @@ def test_a_squat_moves_skin_as_the_statue_and_props_stiffly(file, written, statu
     U = turn_up(2).T
     turned = replace(motion, poses=motion.poses @ U, trans=motion.trans @ U)
     animate_own_mesh(tmp_path / "own.glb", written[0], in_file_axes(statue), turned, "mixamo")
-    moved = SkinnedFile(tmp_path / "own.glb")
+    moved = Glb((tmp_path / "own.glb").read_bytes())
     assert moved.bones[0] == "mixamorig:Hips" and written[1]["own mesh, loose parts that stay stiff"] == 2
     skin, ball, staff = moved.vertices(1)
     rest, ball_before, staff_before = moved.vertices()
@@ -157,14 +157,14 @@ def test_other_files_become_glb_in_metres_with_y_up(statue, tmp_path, ending):
     metres = read_scan(ScanTask("scan", path), "mm")[-1]
     assert metres == 0.001
     write_own_mesh(tmp_path / "own.glb", path, metres, statue)
-    own = SkinnedFile(tmp_path / "own.glb")
+    own = Glb((tmp_path / "own.glb").read_bytes())
     places = np.unique(np.concatenate(own.vertices()).round(5), axis=0)
     wanted = np.unique((mesh.vertices @ turn_up(2).T).round(5), axis=0)
     assert cKDTree(wanted).query(places)[0].max() < 2e-5 and len(own.bones) == len(NAMES)
     again = read_mesh(tmp_path / "own.glb")                                             # our reader turns it back
     assert off(np.ptp(again.vertices, axis=0), np.ptp(mesh.vertices, axis=0)) < 1e-4
     if ending == "obj":
-        assert len(own.tree["images"]) == 1 and "TEXCOORD_0" in own.tree["meshes"][0]["primitives"][0]["attributes"]
+        assert len(own.json["images"]) == 1 and "TEXCOORD_0" in own.json["meshes"][0]["primitives"][0]["attributes"]
 
 
 def test_a_skin_of_the_file_is_replaced_and_morph_targets_stay(file, written, statue, tmp_path):
@@ -184,11 +184,11 @@ def test_a_skin_of_the_file_is_replaced_and_morph_targets_stay(file, written, st
     rows = {row.name: row.value for row in write_own_mesh(tmp_path / "own.glb", again, 2.0, replace(
         in_file_axes(statue), control=in_file_axes(statue).control.refit(
             2 * HUMAN.mesh.vertices @ turn_up(2).T, 2 * HUMAN.skeleton.joints @ turn_up(2).T)))}
-    own = SkinnedFile(tmp_path / "own.glb")
-    assert own.bones == list(NAMES) and len(own.tree["skins"]) == 1 and rows["own mesh, morph targets kept"] == 1
+    own = Glb((tmp_path / "own.glb").read_bytes())
+    assert own.bones == list(NAMES) and len(own.json["skins"]) == 1 and rows["own mesh, morph targets kept"] == 1
     assert off(np.concatenate(own.vertices()), 2 * places_of(file)) < 2e-5 * HEIGHT
-    assert own.tree["meshes"][0]["extras"] == {"targetNames": ["smile"]}
-    smile = own.array(own.tree["meshes"][0]["primitives"][0]["targets"][0]["POSITION"])
+    assert own.json["meshes"][0]["extras"] == {"targetNames": ["smile"]}
+    smile = own.array(own.json["meshes"][0]["primitives"][0]["targets"][0]["POSITION"])
     assert off(np.linalg.norm(smile, axis=1), 2) < 1e-4
 
 
@@ -205,8 +205,8 @@ def test_a_statue_without_or_with_another_mesh_says_what_to_do(statue, written, 
     write_mesh(tmp_path / "scan.ply", HUMAN.mesh)
     write_own_mesh(tmp_path / "statue" / "own.glb", tmp_path / "scan.ply", 1.0, statue)
     assert main([*words, "--names", "unreal"]) == 0
-    moved = SkinnedFile(tmp_path / "out" / "own.glb")
-    assert moved.bones[:2] == ["pelvis", "spine_01"] == SkinnedFile(tmp_path / "out" / "statue.glb").bones[:2]
+    moved = Glb((tmp_path / "out" / "own.glb").read_bytes())
+    assert moved.bones[:2] == ["pelvis", "spine_01"] == Glb((tmp_path / "out" / "statue.glb").read_bytes()).bones[:2]
     assert np.abs(np.concatenate(moved.vertices(1)) - np.concatenate(moved.vertices())).max() > 0.3
 
 

@@ -93,7 +93,7 @@ def errors_between(model: BodyModel, made: Sequence[np.ndarray], truth: np.ndarr
 
 
 def pose_errors(model: BodyModel, bodies: np.ndarray, subject: Subject | None = None,
-                config: FitConfig | None = None, progress: Progress | None = None) -> PoseErrors:
+                progress: Progress | None = None) -> PoseErrors:
     """Compute the errors of one person's bodies after fitting pose and place.
 
     Parameters
@@ -104,8 +104,6 @@ def pose_errors(model: BodyModel, bodies: np.ndarray, subject: Subject | None = 
         Registered bodies of the subject, preferably not those that the model was trained on.
     subject : Subject, optional
         Whose bodies they are; by default the template's own body.
-    config : FitConfig, optional
-        Settings of the fit.
     progress : callable, optional
         Called as progress(done, total), counting bodies.
 
@@ -129,7 +127,7 @@ def pose_errors(model: BodyModel, bodies: np.ndarray, subject: Subject | None = 
     """
     bodies = check_bodies(model.template, bodies, "bodies")
     subject = subject or model.subject()
-    fitter, fits = PoseFitter(subject, config), list[PoseFit]()
+    fitter, fits = PoseFitter(subject), list[PoseFit]()
     for body in bodies:
         fits.append(fitter.fit(body))
         if progress:

@@ -30,7 +30,6 @@ from ..fitting.search import ModelMismatchError
 from .body import Kind, learn_body
 from .config import LearnConfig
 from .mixing import MIX
-from .parts import ChosenSkeleton
 from .skinning import SkinConfig
 
 WITH_PRIOR = "scape", "blendscape"
@@ -121,7 +120,7 @@ def learn(poses: Path, output: Output, shapes: Path | None = None, skeleton: Pat
         *about(learned.model), Metric("poses", len(posed)),
         *([] if few == many else [Metric("learned on", f"{few} of {many} vertices")]),
         Metric("people", 0 if people is None else len(people)), Metric("parts of the skeleton", len(tree.parents)),
-        *_about_choice(learned.choice), *_about_prior(learned.model),
+        *_about_prior(learned.model),
         *[Metric(f"people of the {name} model", model.info["shapes"]) for name, model in learned.models.items()
           if by_sex],
         *details([Metric("kind", learned.model.kind), Metric("triangles", len(body.faces))])],
@@ -148,14 +147,6 @@ def _read_people(shapes: Path, body: Mesh, unit: Unit | None) -> tuple[np.ndarra
                          "one person needs none")
     check_members(body, people, str(shapes), names)
     return people, names
-
-
-def _about_choice(choice: ChosenSkeleton | None) -> list[Metric]:
-    """Say which other numbers of parts predict left-out poses as well."""
-    if choice is None:
-        return []
-    fewest, most = choice.as_good
-    return [] if fewest == most else [Metric("parts that predict left-out poses as well", f"{fewest} to {most}")]
 
 
 def _about_prior(model: BodyModel) -> list[Metric]:

@@ -45,13 +45,11 @@ class ChosenSkeleton:
 
     Examples
     --------
-    One part predicts as well as eight:
-
     >>> from scanprep.synthetic.topology import load_topology
     >>> mesh = load_topology().mesh
     >>> whole = Skeleton(np.zeros(len(mesh.faces), dtype=int), [-1], mesh.vertices.mean(axis=0)[None])
-    >>> ChosenSkeleton(whole, {1: 0.0101, 4: 0.014, 8: 0.01}, True).as_good
-    (1, 8)
+    >>> ChosenSkeleton(whole, {1: 0.0101, 4: 0.014, 8: 0.01}, True).error
+    0.0101
     """
 
     skeleton: Skeleton
@@ -63,12 +61,6 @@ class ChosenSkeleton:
     def error(self) -> float:
         """Error of left-out poses with the chosen parts, metres."""
         return self.errors[len(self.skeleton.parents)]
-
-    @property
-    def as_good(self) -> tuple[int, int]:
-        """The fewest and the most parts that predict left-out poses as well as the chosen ones, within 3%."""
-        level = [parts for parts, error in self.errors.items() if error <= self.error * (1 + GAIN)]
-        return min(level), max(level)
 
 
 @take_any_mesh
@@ -193,8 +185,6 @@ class PartsSearch:
             if len(poses) == 1:
                 return prior.design.left_out_error
         return learn_pose(parts, poses, QUICK, ProgressShares(None), prior=prior).design.left_out_error
-
-
 
 
 def coarse_copy(template: Mesh, count: int) -> tuple[np.ndarray, Mesh]:

@@ -114,15 +114,13 @@ def _groups(sexes: Sequence[str], count: int) -> dict[str, np.ndarray]:
 class SexPlane:
     """A plane between the betas of women and men.
 
-    `weights` (K,) is its unit normal, towards the men; the signed distance is `weights @ betas + bias`. In cross-
-    validation the share `accuracy` of the `count` people was classified right. The probability of a man is
-    `1 / (1 + exp(-slope distance))`.
+    `weights` (K,) is its unit normal, towards the men; the signed distance is `weights @ betas + bias`. It was learned
+    from `count` people. The probability of a man is `1 / (1 + exp(-slope distance))`.
     """
 
     weights: np.ndarray
     bias: float
     count: int
-    accuracy: float
     slope: float
 
     def to_arrays(self) -> dict[str, Any]:
@@ -157,7 +155,7 @@ def learn_sex_plane(betas: np.ndarray, sexes: Sequence[str]) -> SexPlane:
     margins, C = tried[int(np.argmax(right))]
     weights, bias = _plane(betas, men, C)
     weights = np.pad(weights, (0, count - len(weights)))
-    return SexPlane(weights, bias, len(betas), max(right), _certainty(margins, men))
+    return SexPlane(weights, bias, len(betas), _certainty(margins, men))
 
 
 def _plane(betas: np.ndarray, men: np.ndarray, C: float) -> tuple[np.ndarray, float]:
@@ -221,7 +219,7 @@ def sex_plane(model: BodyModel) -> SexPlane:
                          "learn_by_sex (scape learn --by-sex)")
     try:
         weights = np.array(stored["weights"], dtype=np.float64)
-        numbers = {name: float(stored[name]) for name in ("bias", "accuracy", "slope")}
+        numbers = {name: float(stored[name]) for name in ("bias", "slope")}
         if weights.shape != (model.n_betas,) or not np.isfinite([*weights, *numbers.values()]).all():
             raise ValueError(f"expected {model.n_betas} finite weights, found shape {weights.shape}")
         return SexPlane(weights, count=int(stored["count"]), **numbers)

@@ -54,7 +54,7 @@ def moving_body(motion: StoredMotion) -> MovingSkeleton:
     U = turn_up(up)
     offsets = rest - np.where(PARENTS[:, None] < 0, 0, rest[PARENTS])
     places = joint_places(tree, motion.poses[:, :BODY], motion.trans - rest[0]) @ U.T
-    return MovingSkeleton(NAMES, PARENTS, offsets, {}, U @ R, places, motion.rate)
+    return MovingSkeleton(NAMES, PARENTS, offsets, U @ R, places, motion.rate)
 
 
 def with_joints(poses: np.ndarray, count: int) -> np.ndarray:

@@ -69,12 +69,11 @@ def read_bvh(path: str | Path, unit: str, rate: float | None = None) -> MovingSk
     with taking_apart(path, "a BVH file"):
         lines = tables.decode_text(data).splitlines()
     words = _Words(path, lines)
-    joints, ends = _read_hierarchy(words)
+    joints = _read_hierarchy(words)
     table, own_rate = _read_motion(words, joints, rate)
     R, places = _forward_kinematics(joints, table, metre)
     names, parents, offsets, _ = zip(*joints, strict=True)
-    return MovingSkeleton(names, np.array(parents), metre * np.array(offsets),
-                          {j: metre * np.array(end) for j, end in ends.items()}, R, places, own_rate)
+    return MovingSkeleton(names, np.array(parents), metre * np.array(offsets), R, places, own_rate)
 
 
 class _Words:
@@ -152,19 +151,19 @@ class _Joint(NamedTuple):
     channels: list[tuple[str, int]]
 
 
-def _read_hierarchy(words: _Words) -> tuple[list[_Joint], dict[int, list[float]]]:
-    """Read the joints of HIERARCHY, and the End Sites by the numbers of their joints."""
+def _read_hierarchy(words: _Words) -> list[_Joint]:
+    """Read the joints of HIERARCHY; End Sites say nothing that a motion needs."""
     words.keyword("HIERARCHY")
     words.keyword("ROOT")
     names: set[str] = set()
-    joints, ends, above = [_read_joint(words, -1, names)], {}, [0]
+    joints, above = [_read_joint(words, -1, names)], [0]
     while above:
         word = words.keyword("JOINT", "End", "}")
         if word == "}":
             above.pop()
         elif word == "end":
             words.name()
-            ends[above[-1]] = words.offset()
+            words.offset()
             words.keyword("}")
         else:
             joints.append(_read_joint(words, above[-1], names))
@@ -175,7 +174,7 @@ def _read_hierarchy(words: _Words) -> tuple[list[_Joint], dict[int, list[float]]
         more = [line.split()[1] for line in words.lines[words.line - 1:] if re.match(r"\s*root\s+\S", line, re.I)]
         raise StorageError(f"{words.path}, line {words.line}: expected the skeleton of one person, found several: "
                            f"{', '.join([joints[0].name, *more])[:80]}; export each to a file of its own")
-    return joints, ends
+    return joints
 
 
 def _read_joint(words: _Words, parent: int, names: set[str]) -> _Joint:

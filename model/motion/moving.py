@@ -18,7 +18,6 @@ class MovingSkeleton:
     names: tuple[str, ...]           # of the J joints, parent before child
     parents: np.ndarray              # (J,) int, -1 at the root
     offsets: np.ndarray              # (J, 3) metres, each joint from its parent at rest, where no joint is turned
-    ends: dict[int, np.ndarray]      # End Sites by number of their joint: (3,) metres from it, at rest
     rotations: np.ndarray            # (T, J, 3, 3) of every joint in the world: `R_j = R_parent(j) R`
     places: np.ndarray               # (T, J, 3) metres, of every joint in the world
     rate: float                      # frames a second
@@ -38,5 +37,5 @@ class MovingSkeleton:
 def set_in_motion(skeleton: Skeleton, poses: np.ndarray, trans: np.ndarray, rate: float) -> MovingSkeleton:
     """Build the moving skeleton of poses (T, J, 3), radians, and trans (T, 3), metres, of a body's parts."""
     offsets = skeleton.joints - np.where(skeleton.parents[:, None] < 0, 0, skeleton.joints[skeleton.parents])
-    return MovingSkeleton(skeleton.names, skeleton.parents, offsets, {}, skeleton.part_rotations(poses),
+    return MovingSkeleton(skeleton.names, skeleton.parents, offsets, skeleton.part_rotations(poses),
                           joint_places(skeleton, poses, trans), rate)

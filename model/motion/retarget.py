@@ -160,10 +160,10 @@ class Pairing:
         return _upright(forwards, _nearest_axis(high))
 
 
-def retarget_pair(pair: Pairing, aligned: bool = False, girdle: float = 0.2, here: bool = False) -> Retargeted:
+def retarget_pair(pair: Pairing, aligned: bool = False, here: bool = False) -> Retargeted:
     """Retarget the motion of a pair's skeleton to its body; with `aligned`, the two have the same rest pose.
 
-    Where the motion has no clavicles, ours are raised by a share `girdle` of the upper arms' elevation.
+    Where the motion has no clavicles, ours are raised by a fifth of the upper arms' elevation.
     Travel is scaled as the legs are, about the origin of the file. With `here` it begins where the body stands at rest.
     """
     # rotation of every part: of the trunk, of the joint with the same role or name, else that of the parent
@@ -194,7 +194,7 @@ def retarget_pair(pair: Pairing, aligned: bool = False, girdle: float = 0.2, her
             M[:, j] = M[:, skeleton.parents[j]] if j else np.eye(3)
         if j in rolls and rolls[j].changing.any():
             M[:, j] = M[:, j] @ rotations.exp(rolls[j].changing[:, None] * rolls[j].bone)
-    # missing clavicles are raised by a share of the upper arms' angle above the horizontal
+    # missing clavicles are raised by a fifth of the upper arms' angle above the horizontal: the girdle's share there
     left, high, _ = pair.axes.T
     for side, outwards in (("l", left), ("r", -left)):
         parts = [pair.ours.get(f"{side}_{name}") for name in ("sternoclavicular", "shoulder", "elbow")]
@@ -204,7 +204,7 @@ def retarget_pair(pair: Pairing, aligned: bool = False, girdle: float = 0.2, her
         own = pair.joints[elbow] - pair.joints[arm]
         own = own / np.linalg.norm(own)
         sine = np.einsum("tab,a,tbc,c->t", np.swapaxes(M[:, clavicle], -1, -2), high, M[:, arm], own)
-        angle = girdle * np.maximum(np.arcsin(np.clip(sine, -1, 1)), 0)
+        angle = 0.2 * np.maximum(np.arcsin(np.clip(sine, -1, 1)), 0)
         M[:, clavicle] = M[:, clavicle] @ rotations.exp(angle[:, None] * np.cross(outwards, high))
     V = pair.world(aligned)
     poses = skeleton.pose_of(V @ M @ np.swapaxes(pair.P, -1, -2))

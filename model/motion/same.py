@@ -60,4 +60,4 @@ def copy_motion(skeleton: Skeleton, rest: Mesh, vertices: Vertices, moving: Movi
     trans = scale * moving.places[:, order[shared[0]]] @ Q - joint_places(skeleton, poses)[:, shared[0]]
     if np.abs(scale * theirs @ Q - ours).max() > 1e-3:          # metres: bones of another person; correct the soles
         trans = trans + lift(vertices, poses, trans, Q.T @ [0, 1, 0]) * (Q.T @ [0, 1, 0])
-    return Retargeted(poses, trans, moving.rate, dict(zip(names, names, strict=True)), (), float(scale))
+    return Retargeted(poses, trans, moving.rate, dict(zip(names, names, strict=True)))

@@ -17,7 +17,7 @@ from model.features import twists
 from model.fitting import energy
 from model.fitting.bodies import FixedBody
 from model.linear import Subject, check_subject
-from model.priors import gaussian_prior
+from model.priors import SHRINKAGE, gaussian_prior
 from scanprep.geometry import rotations
 from scanprep.geometry.least_squares import Dense, Minimum, levenberg_marquardt, retract_pose, step_between
 from scanprep.geometry.mesh import Mesh
@@ -30,7 +30,6 @@ from .part_shapes import PartShapes, part_shapes
 BATCH = 64                           # frames whose derivatives are in memory at once
 MOST = 512                           # frames that are solved at once, each by itself
 RATE = 120.0                         # frames per second for which [MoSh] means the weight of the velocity
-SHRINKAGE = 0.3                      # of the covariance of poses: a few dozen poses show correlations by chance
 PLACE_ACCELERATION = 15.0            # m/s², sd of the acceleration of the place: one and a half times gravity
 
 

@@ -20,7 +20,7 @@ from scanprep.skeleton.tree import Skeleton
 
 from ...blend_weights import strongest
 from ...rig import turn_up
-from .chart import Chart, automatic_chart, chart_problem
+from .chart import Chart, automatic_chart
 from .model import ControlModel, control_problem, surface_problem
 
 # share of the surface that the largest component must have: eyes, teeth and claws have a tenth, a second body a half
@@ -34,7 +34,7 @@ def read_control(path: str | Path) -> ControlModel:
 
     For a skinned mesh, the pose of the file is the default pose, turned so that z is up. Joints rotate about three axes
     with wide limits, every part is a segment of its own, and there are no landmarks. Joints without triangles are left
-    out. Without texture coordinates a chart is made. StorageError says what is wrong with a file.
+    out. A chart is made for the images. StorageError says what is wrong with a file.
     """
     readers = {".npz": _load, ".glb": _read_skinned}
     if Path(path).suffix.lower() not in readers:
@@ -109,7 +109,7 @@ def _read_skinned(path: Path) -> ControlModel:
         joint_places = np.stack([places[number] for number in joints])[:, :3, 3]
         whole = {"primitives": [primitive for node in skinned
                                 for primitive in glb.item(tree["meshes"], node["mesh"])["primitives"]]}
-        points, weights, uv, faces = _corners(tree, binary, whole, len(joints))
+        points, weights, faces = _corners(tree, binary, whole, len(joints))
         points = glb.apply_skin(points, weights, motion)
         if not np.isfinite(points).all():
             raise ValueError(f"{(~np.isfinite(points).all(axis=1)).sum()} vertices are not finite")
@@ -121,54 +121,45 @@ def _read_skinned(path: Path) -> ControlModel:
             while up is not None and up not in joints:
                 up = above.get(up)
             parents.append(-1 if up is None else joints.index(up))
-        return _control(path, _weld(points, weights, uv, faces), joint_places, np.array(parents),
+        return _control(path, _weld(points, weights, faces), joint_places, np.array(parents),
                         [str(glb.item(tree["nodes"], number).get("name", f"joint{number}")) for number in joints])
 
 
 def _corners(tree: dict[str, Any], binary: bytes, mesh: dict[str, Any], joints: int
-             ) -> tuple[np.ndarray, np.ndarray, np.ndarray | None, np.ndarray]:
-    """Join all primitives of a mesh: points (n, 3), weights (n, joints), texture coordinates (n, 2) and triangles.
+             ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Join all primitives of a mesh: points (n, 3), weights (n, joints) and triangles.
 
     Materials do not divide a control mesh. Points are repeated where normals or texture coordinates differ.
     """
-    points, weights, uv, faces, start = [], [], [], [], 0
+    points, weights, faces = list[np.ndarray](), list[np.ndarray](), list[np.ndarray]()
+    start = 0
     for primitive in mesh["primitives"]:
         if primitive.get("mode", 4) != 4:    # the mode of triangles
             raise ValueError(f"expected triangles, found a primitive of mode {primitive['mode']}")
         attributes = primitive["attributes"]
         points.append(glb.accessor(tree, binary, attributes["POSITION"], "VEC3").astype(np.float64))
-        if "TEXCOORD_0" in attributes:       # glTF counts from the upper left
-            uv.append(glb.accessor(tree, binary, attributes["TEXCOORD_0"], "VEC2").astype(np.float64) * [1, -1]
-                      + [0, 1])
         count, own = len(points[-1]), glb.primitive_triangles(tree, binary, primitive, len(points[-1]))
         if len(own) and (own.min() < 0 or own.max() >= count):
             raise ValueError(f"a triangle refers to vertex {own.max()}, expected 0..{count - 1}")
         weights.append(glb.weights_of(tree, binary, primitive, joints))
         faces.append(own + start)
         start += count
-    return (np.concatenate(points), np.concatenate(weights), np.concatenate(uv) if len(uv) == len(points) else None,
-            np.concatenate(faces))
+    return np.concatenate(points), np.concatenate(weights), np.concatenate(faces)
 
 
-def _control(path: Path, surface: tuple[Mesh, np.ndarray, Chart | None], places: np.ndarray, parents: np.ndarray,
+def _control(path: Path, surface: tuple[Mesh, np.ndarray], places: np.ndarray, parents: np.ndarray,
              names: list[str]) -> ControlModel:
-    whole, weights, chart = surface
-    mesh, weights = _one_surface(path, whole, weights)
-    chart = chart if mesh is whole else None
+    mesh, weights = _one_surface(path, *surface)
     problem = surface_problem(mesh)
     if problem:
         raise ValueError(f"not usable as a control mesh: {problem}")
-    problem = chart_problem(mesh, chart) if chart else None
-    if problem:
-        warnings.warn(f"{path}: a chart is made for the images, its own is not usable: {problem}", stacklevel=2)
-        chart = None
     up = turn_up(2)                                                    # z up, as the people
     mesh, places = mesh.with_vertices(mesh.vertices @ up), places @ up
     kept, parents, weights, part_of_face = _with_triangles(mesh, weights, parents)
     joints, names = places[kept], [names[j] for j in kept]
     distinct = tuple(name if names.count(name) == 1 else f"{name} {k}" for k, name in enumerate(names))
     skeleton, J = Skeleton(part_of_face, parents, joints, distinct).with_root_centred(mesh), len(parents)
-    control = ControlModel(mesh, skeleton, strongest(weights), chart or automatic_chart(mesh, skeleton), {},
+    control = ControlModel(mesh, skeleton, strongest(weights), automatic_chart(mesh, skeleton), {},
                            (np.eye(3),) * J, (np.array([[-np.pi, np.pi]] * 3),) * J, skeleton.names, np.arange(J))
     problem = control_problem(control)
     assert problem is None, problem
@@ -197,25 +188,17 @@ def _one_surface(path: Path, mesh: Mesh, weights: np.ndarray) -> tuple[Mesh, np.
     return body, weights[cKDTree(mesh.vertices).query(body.vertices)[1]]
 
 
-def _weld(points: np.ndarray, weights: np.ndarray, uv: np.ndarray | None, corners: np.ndarray
-          ) -> tuple[Mesh, np.ndarray, Chart | None]:
-    """Weld repeated points: mesh, weights and chart with one vertex at every place."""
+def _weld(points: np.ndarray, weights: np.ndarray, corners: np.ndarray) -> tuple[Mesh, np.ndarray]:
+    """Weld repeated points: mesh and weights with one vertex at every place."""
     _, first, place = np.unique(points.astype(np.float32), axis=0, return_index=True, return_inverse=True)
     order = np.argsort(np.argsort(first))                              # vertices in the order of the file
     first, place = np.sort(first), order[place.reshape(-1)]
     faces = place[corners]
     # triangles that collapse by welding, and unused vertices, are dropped
     whole = (faces != np.roll(faces, 1, axis=1)).all(axis=1)
-    faces, at_corners = faces[whole], corners[whole]
-    used, number = np.unique(faces, return_inverse=True)
+    used, number = np.unique(faces[whole], return_inverse=True)
     mesh = Mesh(points[first[used]], number.reshape(-1, 3))
-    chart = None
-    if uv is not None:
-        rows = np.column_stack([place, np.round(uv * 2**20)])
-        _, once, row = np.unique(rows, axis=0, return_index=True, return_inverse=True)
-        kept, number = np.unique(row.reshape(-1)[at_corners], return_inverse=True)
-        chart = Chart(uv[once[kept]], number.reshape(-1, 3))
-    return mesh, weights[first[used]], chart
+    return mesh, weights[first[used]]
 
 
 def _with_triangles(mesh: Mesh, weights: np.ndarray, parents: np.ndarray
