@@ -181,7 +181,7 @@ def test_missed_points(template):
     second = template.corners.reshape(-1, 3) + [3, 0, 0]
     faces = np.concatenate([template.faces, len(template.vertices) + np.arange(len(second)).reshape(-1, 3)])
     both = Mesh(np.concatenate([template.vertices, second]), faces)
-    assert share_uncovered(both, template, 0.01) == pytest.approx(0.5, abs=0.01)
+    assert share_uncovered(both, template, 0.01) == pytest.approx(0.5, abs=1e-6)
 
 
 def test_tables_keep_their_numbers(tmp_path):
