@@ -59,16 +59,12 @@ def test_parts_that_hang_on_the_same_one_merge_between_their_joints(person):
 
 
 def test_names_and_joints_change_alone(person):
-    mesh, before = person.mesh, person.skeleton
+    before = person.skeleton
     named = rename_part(before, "head", "skull")
     assert named.names[3] == "skull" and np.array_equal(named.joints, before.joints)
-    moved = move_joint(named, mesh, "skull", position=(0.0, 0.1, 1.5))
+    moved = move_joint(named, "skull", (0.0, 0.1, 1.5))
     assert joint(moved, "skull").tolist() == [0.0, 0.1, 1.5]
-    ring = before.ring(mesh, 3)
-    centred = move_joint(named, mesh, 3, ring=ring.tolist())
-    assert np.linalg.norm(joint(centred, "skull") - mesh.vertices[ring].mean(axis=0)) < 0.01
-    for other in (moved, centred):
-        assert np.array_equal(np.delete(other.joints, 3, axis=0), np.delete(before.joints, 3, axis=0))
+    assert np.array_equal(np.delete(moved.joints, 3, axis=0), np.delete(before.joints, 3, axis=0))
 
 
 def test_a_file_of_edits_is_carried_out_in_order(person, tmp_path):
@@ -79,7 +75,7 @@ def test_a_file_of_edits_is_carried_out_in_order(person, tmp_path):
     after = apply_edits(person.skeleton, person.mesh, read_edits(path))
     by_hand = rename_part(rename_part(person.skeleton, "hand_left", "palm"), "head", "skull")
     by_hand = merge_parts(by_hand, person.mesh, "forearm_left", "palm")
-    by_hand = merge_parts(move_joint(by_hand, person.mesh, "forearm_left", (0.5, 0.0, 1.0)), person.mesh, 0, 1)
+    by_hand = merge_parts(move_joint(by_hand, "forearm_left", (0.5, 0.0, 1.0)), person.mesh, 0, 1)
     assert after.names == by_hand.names and after.joints.tobytes() == by_hand.joints.tobytes()
     assert np.array_equal(after.part_of_face, by_hand.part_of_face)
 
@@ -94,9 +90,8 @@ def test_a_file_of_edits_is_carried_out_in_order(person, tmp_path):
     ({"rename": {"head": "7"}}, "not a number"),
     ({"rename": "head"}, "expected {old: new}"),
     ({"move_joint": "pelvis", "position": [0, 0, 1]}, "'pelvis' is the root"),
-    ({"move_joint": "head"}, "expected one of the two"),
+    ({"move_joint": "head"}, "expected a position"),
     ({"move_joint": "head", "position": [0, 0]}, "three finite numbers"),
-    ({"move_joint": "head", "ring": [1, 2, 10**6]}, "expected at least three vertices"),
     ({"move_joint": 99, "position": [0, 0, 1]}, "a number below 16, got 99"),
     ({"split": "head"}, "expected one of merge, rename, move_joint, found"),
     ({"merge": ["head", "chest"], "rename": {}}, "expected one of merge, rename, move_joint, found"),

@@ -83,8 +83,7 @@ def search_skeleton(template: Mesh, poses: np.ndarray, config: SkeletonConfig | 
     config = config or SkeletonConfig()
     finder = SkeletonFinder(template, poses, config, progress)
     # the restart with the best score; its tree is adapted to the requested number of parts
-    best = finder.runs[0]
-    skeleton, symmetric = finder.skeleton(best, config.parts)
+    skeleton, symmetric = finder.skeleton()
     search = SkeletonSearch(skeleton, finder.symmetry, symmetric,
                             tuple(run.energy for run in finder.runs), tuple(len(run.links) + 1 for run in finder.runs))
     if progress is not None:
