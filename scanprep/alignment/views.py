@@ -43,7 +43,6 @@ class AlignedViews:
     views: list[tuple[Mesh, np.ndarray]]     # moved surfaces and camera positions, ready for `merge_views`
     rms: float                               # metres, RMS point-to-plane distance of the matches at the end
     converged: bool
-    iterations: int
     overlap: np.ndarray                      # (V,) share of each view that others also saw
     conflict: np.ndarray                     # (V,) share that violates free space of others; 0 for a correct pose
     trusted: np.ndarray                      # (V,) converged, enough overlap, little conflict; else do not merge
@@ -86,7 +85,7 @@ def align_views(views: Sequence[Any], config: AlignViewsConfig | None = None,
     out = [_move(pair, T) for pair, T in zip(pairs, poses, strict=True)]
     overlap, conflict = fit_of_views(out)
     trusted = settled & (overlap >= config.min_overlap) & (conflict <= CONFLICT) | (len(out) == 1)
-    return AlignedViews(out, rms, settled, rounds, overlap, conflict, trusted)
+    return AlignedViews(out, rms, settled, overlap, conflict, trusted)
 
 
 def _move(view: tuple[Mesh, np.ndarray], T: np.ndarray) -> tuple[Mesh, np.ndarray]:

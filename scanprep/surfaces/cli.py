@@ -199,12 +199,10 @@ def align_cameras(views: ViewsArg, output: Output, landmarks: Path | None = None
     for name, (mesh, _) in placed.items():
         write_mesh(output / f"{name}.ply", mesh)
     storage.write_json(output / "cameras.json", {name: camera.tolist() for name, (_, camera) in placed.items()})
-    shifts = [float(np.linalg.norm(new - old)) for (_, new), (_, old) in zip(found.views, seen, strict=True)]
     doubts = views_doubts(found, names)
     return Outcome(output, [
         Metric("views", len(seen)), Metric("distance between views, RMS", MM * found.rms, "mm"),
-        Metric("rounds", found.iterations), Metric("converged", str(found.converged)),
-        Metric("largest shift of a camera", MM * max(shifts), "mm"),
+        Metric("converged", str(found.converged)),
         Metric("seen by others too, least of a view", 100 * float(found.overlap.min()), "%"),
         Metric("looked through by others, most of a view", 100 * float(found.conflict.max()), "%")],
                    {"views": config}, doubts,
