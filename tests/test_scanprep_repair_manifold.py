@@ -1,6 +1,6 @@
 import numpy as np
 import pytest
-from scanned_shapes import ball, bumpy
+from scanned_shapes import ball, bumpy, joined
 
 from scanprep.geometry.mesh import Mesh, template_problem
 from scanprep.geometry.remeshing import smooth_taubin
@@ -10,12 +10,6 @@ from scanprep.repair.manifold import (
     orient_triangles,
     repair,
 )
-
-
-def joined(*meshes):
-    starts = np.cumsum([0] + [len(m.vertices) for m in meshes[:-1]])
-    return Mesh(np.concatenate([m.vertices for m in meshes]),
-                np.concatenate([m.faces + s for m, s in zip(meshes, starts, strict=True)]))
 
 
 def soup(mesh):

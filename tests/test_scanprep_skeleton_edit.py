@@ -4,8 +4,7 @@ import json
 import numpy as np
 import pytest
 
-from scanprep.geometry.storage import StorageError
-from scanprep.skeleton.edit import apply_edits, find_part_number, merge_parts, move_joint, read_edits, rename_part
+from scanprep.skeleton.edit import apply_edits, merge_parts, move_joint, read_edits, rename_part
 from scanprep.skeleton.tree import Skeleton
 from scanprep.synthetic.people import SyntheticPerson
 
@@ -100,23 +99,6 @@ def test_a_wrong_edit_is_refused_by_number_and_words(person, edit, message):
     with pytest.raises(ValueError, match=message) as caught:
         apply_edits(person.skeleton, person.mesh, [{"rename": {"head": "head"}}, edit])
     assert str(caught.value).startswith("edits: entry 2, {")
-
-
-def test_files_that_hold_no_edits_are_refused(tmp_path):
-    path = tmp_path / "edits.json"
-    for text, message in (("[{", "cannot read it"), ('{"merge": 1}', "found something else")):
-        path.write_text(text)
-        with pytest.raises(StorageError, match=message):
-            read_edits(path)
-    with pytest.raises(StorageError, match="no such file"):
-        read_edits(tmp_path / "none.json")
-
-
-def test_parts_are_known_by_name_and_number(person):
-    assert [find_part_number(person.skeleton, part) for part in ("head", 3, "3", np.int64(3))] == [3, 3, 3, 3]
-    for wrong in (-1, 16, True, "Head", None):
-        with pytest.raises(ValueError, match="part: expected one of"):
-            find_part_number(person.skeleton, wrong)
 
 
 def test_a_skeleton_of_another_template_is_refused(person):

@@ -170,14 +170,6 @@ def test_moving_the_bodies_and_the_template_changes_nothing_but_the_place(
     assert np.allclose(skeleton.joints[1:], found.joints[1:] @ R0.T + t0, atol=1e-4)
 
 
-@pytest.mark.slow
-def test_noise_leaves_the_parts(figure: Figure, poses: np.ndarray) -> None:
-    noisy = poses + np.random.default_rng(9).normal(0, 0.005, poses.shape)
-    part = match(figure, skeleton := find_skeleton(figure.template, noisy, FEW))
-    assert len(skeleton.parents) == len(BOXES)
-    assert np.linalg.norm(skeleton.joints[part[1:]] - JOINTS[1:], axis=1).max() < 0.01
-
-
 def test_bad_poses_are_refused_by_name(figure: Figure, poses: np.ndarray) -> None:
     template = figure.template
     with pytest.raises(ValueError, match=r"poses: expected shape \(M, \d+, 3\)"):

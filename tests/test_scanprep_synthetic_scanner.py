@@ -73,15 +73,6 @@ def test_the_scan_has_its_own_triangulation_and_the_seed_decides(body):
     assert not np.array_equal(one.merged.vertices, three.merged.vertices)
 
 
-def test_settings_are_checked(body):
-    with pytest.raises(ValueError, match="views"):
-        ScannerConfig(views=0)
-    with pytest.raises(ValueError, match="noise"):
-        ScannerConfig(noise=-1)
-    with pytest.raises(ValueError, match="mesh"):
-        scan(Mesh(np.zeros((3, 3)), np.zeros((0, 3))))
-
-
 def scans(folder, seed, poses, people):
     return [data_set.synthetic_scan(folder, seed, *which, COARSE) for which in data_set.scan_plan(poses, people)]
 

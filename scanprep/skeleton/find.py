@@ -83,7 +83,8 @@ def search_skeleton(template: Mesh, poses: np.ndarray, config: SkeletonConfig | 
     config = config or SkeletonConfig()
     finder = SkeletonFinder(template, poses, config, progress)
     # the restart with the best score; its tree is adapted to the requested number of parts
-    skeleton, symmetric = finder.skeleton()
+    best = finder.runs[0]
+    skeleton, symmetric = finder.skeleton(best, config.parts)
     search = SkeletonSearch(skeleton, finder.symmetry, symmetric,
                             tuple(run.energy for run in finder.runs), tuple(len(run.links) + 1 for run in finder.runs))
     if progress is not None:

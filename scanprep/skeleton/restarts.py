@@ -3,10 +3,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
 from ..batch.pool import SideBySide
+from ..batch.room import Step, run_uncached
 from ..geometry.members import ONE_BODY, check_members
 from ..geometry.mesh import Mesh, check_template
 from .joints import (
@@ -31,15 +33,16 @@ Tree = tuple[np.ndarray, np.ndarray]
 
 
 class SkeletonFinder:
-    """The search with several restarts.
+    """The search with several restarts; skeletons with any number of parts follow from the same restarts.
 
-    Arguments and errors are those of `find_skeleton`. `runs` are the restarts, best first.
+    Arguments and errors are those of `find_skeleton`; the requested number of parts does not matter here. `runs` are
+    the restarts, best first; `first` is the one that was started first.
 
     [Articulated]
     """
 
     def __init__(self, template: Mesh, poses: np.ndarray, config: SkeletonConfig,
-                 progress: Callable[[int, int], None] | None = None) -> None:
+                 progress: Callable[[int, int], None] | None = None, step: Step = run_uncached) -> None:
         check_template(template)
         poses = np.asarray(poses, dtype=np.float64)
         n = len(template.vertices)
@@ -57,19 +60,20 @@ class SkeletonFinder:
         if tied and not self.symmetry.two_sided:
             raise ValueError("symmetric: this template has no two sides")
         report_progress, self.surface = _progress(progress, config.restarts), PosedSurface(template, poses)
+        # a restart does not depend on the requested number of parts or on the other restarts: cached results stay valid
+        kept = partial(step, inputs=(template, poses, replace(config, parts=None, restarts=1)))
         symmetry = self.symmetry if tied else None
-        runs = _restarts(self.surface, config, symmetry, report_progress)                 # [Articulated] E- and M-steps
+        runs = _restarts(self.surface, config, symmetry, report_progress, kept)           # [Articulated] E- and M-steps
         if tied and self.symmetry.holds and _is_held_back(_best(runs)):     # few poses: a limb bends on one side only
             both = np.concatenate([poses, mirror_poses(template, poses, self.symmetry)])
             self.surface = PosedSurface(template, both)
-            runs = _restarts(self.surface, config, symmetry, report_progress)
-        self.runs = sorted(runs, key=lambda run: run.score)
+            runs = _restarts(self.surface, config, symmetry, report_progress, kept, "mirrored")
+        self.first, self.runs = runs[0], sorted(runs, key=lambda run: run.score)
 
-    def skeleton(self) -> tuple[Skeleton, bool]:
-        """Build the skeleton of the best restart, with the requested parts; and say whether left and right are alike.
-        """
-        surface, config = self.surface, self.config
-        label, links, tied = _of_count(self.runs[0], surface, config)
+    def skeleton(self, run: Restart, parts: int | None) -> tuple[Skeleton, bool]:
+        """Build the skeleton of a restart, with `parts` parts if given; and say whether left and right are alike."""
+        surface, config = self.surface, replace(self.config, parts=parts)
+        label, links, tied = _of_count(run, surface, config)
         if tied:
             # let the borders of both sides move freely, as no body is quite symmetric; keep that if the tree stays the
             # same
@@ -110,14 +114,16 @@ class Restart:
 
 
 def _restarts(surface: PosedSurface, config: SkeletonConfig, symmetry: Symmetry | None,
-              report_progress: Callable[[], None]) -> list[Restart]:
-    """Run all restarts in parallel."""
+              report_progress: Callable[..., None],
+              kept: Callable[..., Tree], poses: str = "") -> list[Restart]:
+    """Run all restarts in parallel; `poses` names the set of poses in the cache."""
     rng = np.random.default_rng(config.seed)
     searches = [PartSearch(surface, config, symmetry, rng) for _ in range(config.restarts)]
     runs = []
     with SideBySide(_search, searches) as found:
         for number, search in enumerate(searches):
-            label, links = found(number)
+            label, links = kept(f"{poses or ('free' if symmetry is None else 'symmetric')} restart {number}",
+                                make=partial(found, number))
             search.forget()
             runs.append(Restart(label, links, search.energy(label) / surface.area, _score(search, label),
                                 search))

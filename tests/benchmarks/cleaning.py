@@ -22,7 +22,7 @@ from scanprep.fusion.tsdf import merge_views
 from scanprep.geometry import rotations
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.surface import Surface
-from scanprep.repair.hole_filling import FillConfig, fill_report
+from scanprep.repair.hole_filling import fill_report
 from scanprep.repair.intersections import intersecting_faces
 from scanprep.synthetic.scanner import RangeView, scan
 
@@ -147,11 +147,7 @@ def merge_peers(views: list[RangeView], truth: Mesh) -> Iterator[tuple[str, dict
 
 def fillers() -> dict[str, Callable[[Mesh], tuple[Mesh, bool]]]:
     """Name -> function to a filled mesh and whether the triangles of the old one come first in it."""
-    def ours(method: str) -> Callable[[Mesh], tuple[Mesh, bool]]:
-        return lambda mesh: (fill_report(mesh, FillConfig(method=method)).mesh, True)     # type: ignore[arg-type]
-
-    found = {f"scapekit {method}": ours(method) for method in ("auto", "fair", "diffusion")}
-    found["trimesh fill_holes"] = trimesh_fill
+    found = {"scapekit": lambda mesh: (fill_report(mesh).mesh, True), "trimesh fill_holes": trimesh_fill}
     try:
         import open3d  # noqa: F401
 
