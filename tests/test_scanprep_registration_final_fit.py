@@ -86,7 +86,7 @@ def test_holes_follow_the_template(truth):
     start = truth.vertices.copy()
     start[hole] += 0.006 * truth.vertex_normals[hole]
     found = fitted(crab(), start, points)
-    assert not found.seen[hole].any()
+    assert not found.seen[np.linalg.norm(truth.vertices - middle, axis=1) < 0.046].any()      # nor beside its edge
     assert found.seen[~hole].mean() > 0.85
     assert np.linalg.norm(found.vertices - truth.vertices, axis=1)[hole].mean() < 0.004
 
