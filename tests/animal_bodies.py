@@ -9,8 +9,7 @@ from dataclasses import dataclass
 from functools import cached_property, lru_cache
 
 import numpy as np
-from implicit_surface import Field, Group, RoundCone, project
-from polygonise import polygonise
+from implicit_surface import Field, Group, RoundCone, polygonise, project
 
 from scanprep.decimation.decimate import decimate
 from scanprep.geometry import rotations

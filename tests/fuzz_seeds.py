@@ -42,8 +42,7 @@ from scanprep.skeleton.edit import read_edits
 from scanprep.skeleton.tree import Skeleton
 from scanprep.surfaces.cli import _read_views
 from scanprep.synthetic.anatomy import BodyShape
-from scanprep.synthetic.data_set import GroundTruth, _write_views, read_views
-from scanprep.synthetic.scanner import RangeView, Scan
+from scanprep.synthetic.data_set import GroundTruth
 
 MARKS = {"nose": 3, "left": 100, "right": 200, "tail": 380}
 
@@ -303,9 +302,6 @@ def _add_sets(rng: np.random.Generator, place: Any, add: Any, text: Any) -> None
     GroundTruth(BodyShape(), np.zeros((4, 3)), np.zeros(3), body.vertices, body.faces, tree.part_of_face,
                 tree.joints).save(path := place("truth.npz"))
     add(path, GroundTruth.load, lambda found: good_mesh(found.mesh))
-    view = RangeView(body, body.vertex_normals, np.zeros(3), np.eye(4), np.full((3, 4), np.nan), np.eye(3))
-    _write_views(path := place("views.npz"), Scan((view,), body))
-    add(path, read_views, lambda found: [good_mesh(one.mesh) for one in found])
 
 
 def _settings(path: Path) -> dict[str, Any]:

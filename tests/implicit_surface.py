@@ -4,17 +4,15 @@ All functions take points (n, 3) in metres and give an approximate signed distan
 """
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Protocol
 
+import igl
 import numpy as np
 
+from scanprep.geometry.mesh import Mesh
 
-class Field(Protocol):
-    """Anything that gives an approximate signed distance."""
-
-    def __call__(self, points: np.ndarray) -> np.ndarray: ...
+Field = Callable[[np.ndarray], np.ndarray]
 
 
 class RoundCone:
@@ -51,16 +49,12 @@ class Bump:
 
     centre: np.ndarray  # (3,) float, metres
     height: float  # metres
-    widths: Sequence[float] | np.ndarray  # (3,) float, metres: standard deviations along the rows of `frame`
-    frame: np.ndarray | None = None  # (3, 3) float, optional
+    widths: np.ndarray  # (3,) float, metres: standard deviations along the axes
 
     def __call__(self, points: np.ndarray) -> np.ndarray:
         out = np.zeros(len(points))
         near = np.flatnonzero(np.abs(points[:, 2] - self.centre[2]) < 4.5 * max(self.widths))
-        local = points[near] - self.centre
-        if self.frame is not None:
-            local = local @ self.frame.T
-        local = local / np.asarray(self.widths)
+        local = (points[near] - self.centre) / self.widths
         out[near] = self.height * np.exp(-0.5 * np.minimum((local * local).sum(axis=1), 60))
         return out
 
@@ -72,28 +66,12 @@ def smooth_union(a: np.ndarray, b: np.ndarray, k: float) -> np.ndarray:
 
 
 class Group:
-    """Fields joined one after the other, each seam rounded over its k metres, evaluated only near themselves.
+    """Fields joined one after the other, each seam rounded over its k metres, with bumps on top."""
 
-    Points outside the capsule `bounds` (two ends and a radius) get their distance to it.
-    """
-
-    MARGIN = 0.06
-
-    def __init__(self, members: Sequence[tuple[Field, float]], bumps: Sequence[Bump] = (),
-                 bounds: tuple[np.ndarray, np.ndarray, float] | None = None) -> None:
-        self.members, self.bumps, self.bounds = list(members), list(bumps), bounds
+    def __init__(self, members: Sequence[tuple[Field, float]], bumps: Sequence[Bump] = ()) -> None:
+        self.members, self.bumps = list(members), list(bumps)
 
     def __call__(self, points: np.ndarray) -> np.ndarray:
-        if self.bounds is None:
-            return self._evaluate(points)
-        a, b, radius = self.bounds
-        d = RoundCone(a, b, radius, radius)(points) + self.MARGIN
-        near = np.flatnonzero(d < self.MARGIN)
-        if len(near):
-            d[near] = self._evaluate(points[near])
-        return d
-
-    def _evaluate(self, points: np.ndarray) -> np.ndarray:
         d = self.members[0][0](points)
         for member, k in self.members[1:]:
             d = smooth_union(d, member(points), k)
@@ -134,3 +112,29 @@ def project(field: Field, points: np.ndarray, steps: int = 4, reach: float = 0.0
         length = np.linalg.norm(step, axis=1, keepdims=True)
         points += step * np.minimum(1, reach / np.maximum(length, 1e-12))
     return points
+
+
+def polygonise(field: Field, low: np.ndarray, high: np.ndarray, step: float) -> Mesh:
+    """The zero surface in a box by marching cubes, as a mesh; open where the box cuts it.
+
+    Only cells near the surface are evaluated finely.
+    """
+    coarse = 6
+    cells = np.ceil((high - low) / (coarse * step)).astype(int)
+    axes = [low[d] + coarse * step * np.arange(cells[d] + 1) for d in range(3)]
+    grid = np.stack(np.meshgrid(*axes[::-1], indexing="ij")[::-1], axis=-1)
+    shape = grid.shape[:3]
+    rough = field(grid.reshape(-1, 3)).reshape(shape)
+    near = np.abs(rough) < 3.2 * coarse * step
+    n = cells * coarse + 1
+    fine_axes = [low[d] + step * np.arange(n[d]) for d in range(3)]
+    index = [np.minimum((np.arange(n[d]) + coarse // 2) // coarse, cells[d]) for d in range(3)]
+    pick = np.ix_(index[2], index[1], index[0])
+    values, todo = rough[pick].copy(), near[pick]
+    points = np.stack(np.meshgrid(*fine_axes[::-1], indexing="ij")[::-1], axis=-1)
+    wanted = points[todo]
+    values[todo] = np.concatenate([field(part) for part in np.array_split(wanted, max(1, len(wanted) // 200_000))])
+    vertices, faces = igl.marching_cubes(values.reshape(-1), points.reshape(-1, 3), *n.tolist(), 0.0)[:2]
+    mesh = Mesh(vertices, np.asarray(faces, dtype=np.int64))
+    outside = field(mesh.corners.mean(axis=1) + 1e-3 * mesh.face_normals)
+    return mesh if np.median(outside) > 0 else Mesh(vertices, mesh.faces[:, ::-1])

@@ -21,8 +21,9 @@ from scanprep.batch.ownership import HOME
 from scanprep.batch.values import load_step_header
 from scanprep.decimation.registered_set import decimate_set
 from scanprep.pipeline.prepare import SCANS
-from scanprep.synthetic.data_set import read_views
+from scanprep.synthetic.data_set import GroundTruth
 from scanprep.synthetic.people import SyntheticPerson, synthesise_walk
+from scanprep.synthetic.scanner import ScannerConfig, scan
 from scanprep.viewer import server
 
 ROOT = Path(__file__).parents[1]
@@ -140,7 +141,8 @@ def user_folder(demo, folder):
     write_figure(folder, SyntheticPerson(PEOPLE[WALKER]), *synthesise_walk(24, RATE))
     shutil.copy(demo / "scans" / f"{mine[1].split(',')[0]}.ply", folder / "anna.ply")
     cameras = {}
-    for k, view in enumerate(read_views(demo / "template_scan" / "views" / "rest.npz")):
+    rest = GroundTruth.load(demo / "template_scan" / "truth" / "rest.npz")
+    for k, view in enumerate(scan(rest.mesh, ScannerConfig(views=12, blind_reach=0.01)).views):
         if k in SIDES:
             write_mesh(folder / f"{SIDES[k]}.ply", view.mesh)
         write_mesh(folder / "views" / f"view{k}.ply", view.mesh.with_vertices(CHILD * view.mesh.vertices))

@@ -47,6 +47,19 @@ def view(mesh: Mesh, towards: np.ndarray, rng=None, noise: float = 0.0, spacing:
     return Mesh(points[seen], corners.reshape(-1, 3)), back
 
 
+def pierced(mesh: Mesh, centres, radius: float) -> Mesh:
+    """A mesh without the triangles within a radius of some places (n, 3) or one."""
+    apart = np.linalg.norm(mesh.corners.mean(axis=1)[:, None] - np.atleast_2d(centres), axis=2)
+    return mesh.submesh((apart > radius).all(axis=1))[0]
+
+
+def joined(*meshes: Mesh) -> Mesh:
+    """Several meshes as one, side by side."""
+    starts = np.cumsum([0] + [len(m.vertices) for m in meshes[:-1]])
+    return Mesh(np.concatenate([m.vertices for m in meshes]),
+                np.concatenate([m.faces + s for m, s in zip(meshes, starts, strict=True)]))
+
+
 def triangle_quality(mesh: Mesh) -> np.ndarray:
     """(F,) 1 for an equilateral triangle, 0 for one without area: 4√3 area over the sum of squared sides."""
     squares = ((mesh.corners - np.roll(mesh.corners, -1, axis=1)) ** 2).sum(axis=(1, 2))

@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 import trimesh
 from animal_bodies import Animal
-from humanoid_maker import NAMES
 from test_model_statue_cli import JOINTS
 
 from completion.__main__ import main
@@ -29,6 +28,7 @@ from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.storage import StorageError
 from scanprep.synthetic.people import SyntheticPerson, find_pose
 
+NAMES = humanoid().skeleton.names
 MIRROR = np.array([-1, 1, 1])
 
 

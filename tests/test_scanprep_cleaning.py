@@ -1,7 +1,7 @@
 import igl
 import numpy as np
 import pytest
-from scanned_shapes import ball
+from scanned_shapes import ball, joined
 
 from scanprep.cleaning.clean_scan import (
     FAR,
@@ -36,12 +36,6 @@ def grid(width, depth, spacing=0.01):
 
 def moved(mesh, by, R=None):
     return mesh.with_vertices(mesh.vertices @ (np.eye(3) if R is None else R).T + np.asarray(by))
-
-
-def joined(*meshes):
-    starts = np.cumsum([0] + [len(m.vertices) for m in meshes[:-1]])
-    return Mesh(np.concatenate([m.vertices for m in meshes]),
-                np.concatenate([m.faces + s for m, s in zip(meshes, starts, strict=True)]))
 
 
 UPRIGHT = rotations.exp(np.array([0, np.pi / 2, 0]))
@@ -217,8 +211,6 @@ def test_a_pedestal_goes_with_its_top_or_is_doubted(width, height, goes):
     body = SyntheticPerson().mesh
     body = moved(body, [*-body.vertices.mean(axis=0)[:2], -body.vertices[:, 2].min()])
     pieces = [body, *plinth(width, height, closed=not goes)]
-    first = np.cumsum([0, *(len(piece.vertices) for piece in pieces)])
-    cleaned = clean_scan(Mesh(np.concatenate([piece.vertices for piece in pieces]),
-                              np.concatenate([piece.faces + n for piece, n in zip(pieces, first, strict=False)])))
+    cleaned = clean_scan(joined(*pieces))
     assert (cleaned.mesh.vertices[:, 2] < -0.02).any() != goes and bool(cleaning_doubts(cleaned)) != goes
     assert cleaned.kept[:len(body.vertices)].mean() > 0.97

@@ -134,11 +134,6 @@ def test_a_set_on_disk(source, tmp_path, poses):
         np.testing.assert_allclose(again.vertices()[:, v], poses[:, int(name[4:])], atol=1e-6)
 
 
-def test_a_set_made_without_landmarks(source, tmp_path):
-    (source.folder / "landmarks.json").write_text("{}")
-    assert len(write_decimated_set(source.folder, tmp_path / "small", 500).template.faces) == 500
-
-
 def test_what_was_interrupted_goes_on(source, tmp_path):
     folder = tmp_path / "small"
 

@@ -37,12 +37,6 @@ def test_noise_averages_out(shape):
     assert Surface(shape).closest(merged.vertices).distances.mean() < 0.7 * before
 
 
-def test_normals_point_outwards(shape, views):
-    merged = merge_views(views, COARSE)
-    at = Surface(shape).closest(merged.vertices)
-    assert (np.einsum("nd,nd->n", merged.vertex_normals, shape.face_normals[at.faces]) > 0.5).mean() > 0.999
-
-
 def test_what_no_view_saw_stays_open(shape, views):
     merged = merge_views(views[:1], COARSE)
     camera = views[0][1]

@@ -53,15 +53,6 @@ def test_noise_is_averaged_out_and_not_followed():
     assert found.moved < 0.001
 
 
-def test_a_vertex_off_the_surface_returns_to_it(truth):
-    rng = np.random.default_rng(1)
-    start = truth.vertices + 0.01 * rng.normal(size=truth.vertices.shape)
-    found = fitted(crab(), start, cloud(truth, noise=0))
-    assert np.linalg.norm(start - truth.vertices, axis=1).mean() > 0.012
-    assert Surface(truth).closest(found.vertices).distances.mean() < 0.001
-    assert np.linalg.norm(found.vertices - truth.vertices, axis=1).mean() < 0.006
-
-
 def test_an_uneven_slide_is_undone():
     """Noise along the surface goes; what remains is what varies slowly, which data cannot tell from growth."""
     body = crab(121, 60)
@@ -95,7 +86,7 @@ def test_holes_follow_the_template(truth):
     start = truth.vertices.copy()
     start[hole] += 0.006 * truth.vertex_normals[hole]
     found = fitted(crab(), start, points)
-    assert not found.seen[hole].any()
+    assert not found.seen[np.linalg.norm(truth.vertices - middle, axis=1) < 0.046].any()      # nor beside its edge
     assert found.seen[~hole].mean() > 0.85
     assert np.linalg.norm(found.vertices - truth.vertices, axis=1)[hole].mean() < 0.004
 

@@ -124,8 +124,6 @@ def test_bad_correspondences_are_named(pairs, word):
         register(crab(), crab(), correspondences=pairs)
 
 
-# ---- matching by descriptors --------------------------------------------------------------------------------------
-
 # ---- ends ---------------------------------------------------------------------------------------------------
 
 def test_an_end_that_is_rotated_about_itself_is_found():

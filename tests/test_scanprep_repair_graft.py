@@ -4,7 +4,7 @@ from types import SimpleNamespace
 import igl
 import numpy as np
 import pytest
-from scanned_shapes import ball
+from scanned_shapes import ball, joined, pierced
 
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.surface import Surface
@@ -23,16 +23,10 @@ def person():
     return load_topology().mesh
 
 
-def cut_at(mesh: Mesh, places: np.ndarray, radius: float) -> Mesh:
-    """Cut a ball out of a mesh around each of the places (n, 3), metres."""
-    apart = np.linalg.norm(mesh.corners.mean(axis=1)[:, None] - places, axis=2)
-    return mesh.submesh((apart > radius).all(axis=1))[0]
-
-
 @pytest.fixture(scope="module")
 def without_a_finger_tip(person):
     tip = person.vertices[landmarks()["left middle finger"]]
-    return cut_at(person, tip[None], 0.03), tip
+    return pierced(person, tip, 0.03), tip
 
 
 def test_a_finger_tip_that_was_cut_off_grows_again(person, without_a_finger_tip):
@@ -48,7 +42,7 @@ def test_a_finger_tip_that_was_cut_off_grows_again(person, without_a_finger_tip)
 
 
 def test_a_hole_in_a_smooth_surface_is_left_to_its_patch(person):
-    scan = cut_at(person, person.vertices[landmarks()["navel"]][None], 0.03)
+    scan = pierced(person, person.vertices[landmarks()["navel"]], 0.03)
     same, pieces = graft(scan, close(scan), person)
     assert pieces == 0 and same is scan
 
@@ -56,8 +50,7 @@ def test_a_hole_in_a_smooth_surface_is_left_to_its_patch(person):
 def test_a_fit_that_fuses_two_fingers_is_not_kept():
     """The scan lacks one finger, here a ball; without data it slides into its neighbour, and the scan is covered."""
     one = ball(3)
-    both = Mesh(np.concatenate([one.vertices, one.vertices + [0.3, 0, 0]]),
-                np.concatenate([one.faces, one.faces + len(one.vertices)]))
+    both = joined(one, one.with_vertices(one.vertices + [0.3, 0, 0]))
     second = np.arange(len(both.vertices)) >= len(one.vertices)
     fused, touching = (both.with_vertices(both.vertices - second[:, None] * [by, 0, 0]) for by in (0.3, 0.1))
     assert (share_doubled(both, both), share_doubled(both, touching), share_doubled(both, fused)) == (0, 0, 1)
@@ -99,7 +92,7 @@ def test_a_piece_takes_what_it_encloses_and_the_largest_comes_first(person):
     assert len(person.submesh(whole)[0].boundary_loops) == 1
     # of the person without a foot and a finger tip, the foot is found first
     heel = person.vertices[landmarks()["left heel"]]
-    scan = cut_at(cut_at(person, heel[None], 0.12), tip[None], 0.03)
+    scan = pierced(pierced(person, heel, 0.12), tip, 0.03)
     missing = find_missing(close(scan), person)
     areas = [person.face_areas[one].sum() for one in missing]
     assert len(areas) >= 2 and areas == sorted(areas, reverse=True)

@@ -1,6 +1,6 @@
 import numpy as np
 import pytest
-from scanned_shapes import ball, bumpy
+from scanned_shapes import ball, bumpy, joined
 
 from scanprep.geometry.mesh import Mesh, template_problem
 from scanprep.geometry.remeshing import smooth_taubin
@@ -9,25 +9,11 @@ from scanprep.repair.manifold import (
     drop_small_components,
     orient_triangles,
     repair,
-    weld,
 )
-
-
-def joined(*meshes):
-    starts = np.cumsum([0] + [len(m.vertices) for m in meshes[:-1]])
-    return Mesh(np.concatenate([m.vertices for m in meshes]),
-                np.concatenate([m.faces + s for m, s in zip(meshes, starts, strict=True)]))
 
 
 def soup(mesh):
     return Mesh(mesh.corners.reshape(-1, 3), np.arange(3 * len(mesh.faces)).reshape(-1, 3))
-
-
-def test_a_soup_of_triangles_becomes_the_mesh_again():
-    mesh = bumpy(3)
-    again = weld(soup(mesh))
-    assert len(again.vertices) == len(mesh.vertices) and again.is_closed
-    assert np.array_equal(again.corners, mesh.corners)
 
 
 @pytest.mark.parametrize("spoil", ["double", "flipped double", "flat", "fin", "unused", "piece", "soup"])
@@ -47,12 +33,6 @@ def test_each_defect_is_removed(spoil):
     assert template_problem(good) is None
     assert len(good.faces) >= len(f) - 1
     assert Surface(good).closest(v).distances.max() < 0.5 * mesh.mean_edge
-
-
-def test_a_good_mesh_comes_back_unchanged():
-    mesh = bumpy(3)
-    again = repair(mesh)
-    assert np.array_equal(again.vertices, mesh.vertices) and np.array_equal(again.faces, mesh.faces)
 
 
 def test_repair_twice_is_repair_once():

@@ -170,20 +170,6 @@ def test_moving_the_bodies_and_the_template_changes_nothing_but_the_place(
     assert np.allclose(skeleton.joints[1:], found.joints[1:] @ R0.T + t0, atol=1e-4)
 
 
-def test_the_same_input_gives_the_same_bytes(figure: Figure, poses: np.ndarray, found: Skeleton) -> None:
-    again = find_skeleton(figure.template, poses, FEW)
-    assert again.joints.tobytes() == found.joints.tobytes()
-    assert again.part_of_face.tobytes() == found.part_of_face.tobytes()
-
-
-@pytest.mark.slow
-def test_noise_leaves_the_parts(figure: Figure, poses: np.ndarray) -> None:
-    noisy = poses + np.random.default_rng(9).normal(0, 0.005, poses.shape)
-    part = match(figure, skeleton := find_skeleton(figure.template, noisy, FEW))
-    assert len(skeleton.parents) == len(BOXES)
-    assert np.linalg.norm(skeleton.joints[part[1:]] - JOINTS[1:], axis=1).max() < 0.01
-
-
 def test_bad_poses_are_refused_by_name(figure: Figure, poses: np.ndarray) -> None:
     template = figure.template
     with pytest.raises(ValueError, match=r"poses: expected shape \(M, \d+, 3\)"):
@@ -196,13 +182,6 @@ def test_bad_poses_are_refused_by_name(figure: Figure, poses: np.ndarray) -> Non
     broken[4, 17, 1] = np.nan
     with pytest.raises(ValueError, match="poses: 1 have vertices that are not finite, the first is pose 4"):
         find_skeleton(template, broken)
-
-
-@pytest.mark.parametrize(("name", "value"), [("parts", 0), ("separation", 0.0),
-                                             ("tolerance", 0.0), ("tolerance", float("nan"))])
-def test_bad_settings_are_refused_by_name(name: str, value: float) -> None:
-    with pytest.raises(ValueError, match=name):
-        replace(SkeletonConfig(), **{name: value})
 
 
 def test_fingers_whose_roots_touch_hang_on_the_palm():

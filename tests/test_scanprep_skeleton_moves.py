@@ -4,7 +4,7 @@ import pytest
 from animal_bodies import Animal, Build, random_pose
 
 from scanprep.skeleton import joints
-from scanprep.skeleton.joints import dissolve_bands, passages, to_tree
+from scanprep.skeleton.joints import dissolve_bands, passages
 from scanprep.skeleton.labels import field_energy, relabel
 from scanprep.skeleton.motions import PosedSurface, agglomerate, halve, rigid_costs
 from scanprep.skeleton.parts import PartSearch, SkeletonConfig
@@ -77,12 +77,3 @@ def test_moves_that_the_alternation_takes_back_come_to_an_end(search, label, mon
     assert passages(search, label)[0].max() > joints.FADING
     monkeypatch.setattr(PartSearch, "alternate", lambda *_, **__: label)
     np.testing.assert_array_equal(move(search, label), label)
-
-
-@pytest.mark.slow
-@pytest.mark.timeout(60)
-def test_a_tree_is_reached_though_the_alternation_cuts_again(search, monkeypatch):
-    label = np.unique(search.patch % 40, return_inverse=True)[1]
-    monkeypatch.setattr(PartSearch, "alternate", lambda *_, **__: label)
-    parts, links = to_tree(search, label)
-    assert len(links) == parts.max() < label.max()

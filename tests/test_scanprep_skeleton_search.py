@@ -178,21 +178,6 @@ def test_another_seed_finds_the_same_tree(animal, poses, found):
     assert len(again.skeleton.parents) == 12
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("count", [9, 13])
-def test_as_many_parts_as_asked_for(animal, poses, count):
-    skeleton = search_skeleton(animal.mesh, poses, replace(CONFIG, parts=count)).skeleton
-    assert len(skeleton.parents) == count
-    assert set(np.unique(skeleton.part_of_face)) == set(range(count))
-
-
-@pytest.mark.slow
-def test_symmetry_can_be_refused(animal, poses, found):
-    free = search_skeleton(animal.mesh, poses, replace(CONFIG, symmetric=False))
-    assert not free.symmetric and free.symmetry.holds
-    assert adjusted_rand(free.skeleton.part_of_face, found.skeleton.part_of_face) > 0.9
-
-
 def test_a_band_between_two_parts_is_no_part(animal, poses):
     """A ring cut out where the knee bends dissolves, its neighbours do not."""
     surface, truth = PosedSurface(animal.mesh, poses), animal.skeleton

@@ -8,6 +8,7 @@ from pathlib import Path
 import igl
 import numpy as np
 import pytest
+from scanned_shapes import triangle_quality
 from scipy.stats import norm
 
 from model.measurement.find import find_tapes
@@ -40,12 +41,6 @@ def man(bodies: list[SyntheticPerson]) -> SyntheticPerson:
     return bodies[0]
 
 
-def quality(mesh: Mesh) -> np.ndarray:
-    """1 for an equilateral triangle, 0 for one without area."""
-    c = mesh.corners
-    return 4 * np.sqrt(3) * mesh.face_areas / ((c - np.roll(c, 1, axis=1))**2).sum(axis=(1, 2))
-
-
 def test_everybody_is_one_closed_outward_surface(bodies):
     for person in bodies:
         mesh = person.mesh
@@ -54,7 +49,7 @@ def test_everybody_is_one_closed_outward_surface(bodies):
         assert len(mesh.vertices) - len(mesh.edges) + len(mesh.faces) == 2, "no handles"
         assert mesh.volume > 0
         # MakeHuman's quads, pressed thin in the groin and between toes, where skin meets skin
-        assert quality(mesh).min() > 1e-3 and np.percentile(quality(mesh), 1) > 0.25
+        assert triangle_quality(mesh).min() > 1e-3 and np.percentile(triangle_quality(mesh), 1) > 0.25
 
 
 def test_the_file_is_what_the_recipe_makes():
@@ -102,13 +97,6 @@ def test_people_of_a_sex_measure_as_those_of_the_survey(sex):
     assert apart.mean() < 0.04 and apart.max() < 0.15
 
 
-@pytest.mark.parametrize("sex", ["female", "male"])
-def test_the_average_of_a_sex_is_not_far_out(sex):
-    """Measures that bodies hardly vary in are not forced: that took betas of 13, women with knees like barrels."""
-    mean, covariance = population().moments[sex]
-    assert np.abs(mean).max() < 1.5 and np.sqrt(np.diag(covariance)).max() < 2
-
-
 def test_the_first_betas_are_stature_weight_and_sex():
     one = [population().rows(np.eye(30)[k] * 0.5)[:12500] for k in range(3)]
     none = population().rows(np.zeros(1))[:12500]
@@ -132,15 +120,6 @@ def test_mass_is_that_of_the_survey(bodies):
         assert 985 * person.mesh.volume == pytest.approx(table.mean[table.names.index("weight")], rel=0.03)
     heavier = SyntheticPerson(BodyShape.like(weight=1.0))
     assert 6 < 985 * (heavier.mesh.volume - bodies[0].mesh.volume) < 18
-
-
-def test_left_and_right_are_mirror_images(bodies):
-    twin = topology.load_topology().mirror
-    assert np.array_equal(twin[twin], np.arange(len(twin)))
-    for person in bodies:
-        v = person.mesh.vertices
-        assert np.abs(v[twin] * [-1, 1, 1] - v).max() < 1e-12
-        assert np.abs(person.joints[topology.PARENTS == 0][:, 0].sum()) < 1e-12
 
 
 def test_mirrored_pose_gives_the_mirrored_body(man):
@@ -204,12 +183,6 @@ def test_parts_follow_their_rotations(man):
         fitted = man.skeleton.fit_rotations(man.mesh, man.in_pose(pose))
         angle = np.degrees(np.linalg.norm(rotations.log(np.swapaxes(R, 1, 2) @ fitted), axis=1))
         assert np.median(angle) < 3 and angle.max() < 15, dict(zip(PARTS, angle.round(1), strict=True))
-
-
-def test_raised_arms_raise_the_shoulders(man):
-    rest, up = man.joints_in_pose(np.zeros((16, 3))), man.joints_in_pose(people.find_pose("arms_up"))
-    assert 0.03 < up[4, 2] - rest[4, 2] < 0.10
-    assert up[4, 2] == pytest.approx(up[7, 2], abs=1e-9)
 
 
 @pytest.mark.parametrize("name", NAMED_POSES)

@@ -34,7 +34,6 @@ from scanprep.synthetic.data_set import (
     GroundTruth,
     SyntheticScan,
     click_landmarks,
-    read_views,
     scan_plan,
     stand,
     synthetic_scan,
@@ -143,8 +142,7 @@ class Demo:
                 marks = click_landmarks(self.rest, rng, seen=careful.merged.vertices)
                 place = folder / "template_scan"
                 write_scan(place, "rest", careful, self.rest, marks)
-                views = read_views(place / "views" / "rest.npz")
-                mesh = template_of_views(views, self.amounts.faces, progress, self.amounts.template_resolution)
+                mesh = template_of_views(careful.views, self.amounts.faces, progress, self.amounts.template_resolution)
             landmarks = read_landmark_vertices(place / "rest.landmarks.json", mesh)
             write_landmarks(folder / "template.landmarks.json", landmarks)
             write_mesh(folder / "template.ply", mesh)
@@ -237,7 +235,7 @@ class Demo:
         seen = scan(truth.mesh, replace(self.scanner, views=1, azimuth=-30.0), rng)
         marks = click_landmarks(truth, rng, seen=seen.merged.vertices)
         chosen = np.array(list(marks))[spread_indices(len(marks), 7)]
-        write_scan(folder / HALF.parent, HALF.stem, seen, truth, {name: marks[name] for name in chosen}, views=False)
+        write_scan(folder / HALF.parent, HALF.stem, seen, truth, {name: marks[name] for name in chosen})
         # the whole body from it
         half, marks = _read_half(folder)
         _, vertices, points = match_landmarks(self.template_landmarks, marks)

@@ -13,7 +13,7 @@ from ..geometry.mesh import Mesh
 from ..geometry.remeshing import smooth_taubin
 from ..geometry.surface import OrientedPoints, mesh_and_camera
 from ..ranges import Positive, Settings, Share
-from .view_poses import fit_of_views, place_by_features, place_by_landmarks
+from .view_poses import fit_of_views, place_by_landmarks
 
 ROUNDS = 60                   # of matching, at most: views that still move then are not trusted
 BORDER = 0.02                 # metres: points nearer to the border of their view are not matched, as edges are noisy
@@ -43,31 +43,27 @@ class AlignedViews:
     views: list[tuple[Mesh, np.ndarray]]     # moved surfaces and camera positions, ready for `merge_views`
     rms: float                               # metres, RMS point-to-plane distance of the matches at the end
     converged: bool
-    iterations: int
     overlap: np.ndarray                      # (V,) share of each view that others also saw
     conflict: np.ndarray                     # (V,) share that violates free space of others; 0 for a correct pose
     trusted: np.ndarray                      # (V,) converged, enough overlap, little conflict; else do not merge
 
 
 def align_views(views: Sequence[Any], config: AlignViewsConfig | None = None,
-                landmarks: Sequence[Mapping[str, np.ndarray]] | None = None, features: bool = False) -> AlignedViews:
+                landmarks: Sequence[Mapping[str, np.ndarray]] | None = None) -> AlignedViews:
     """Refine rough camera poses by point-to-plane matching between all pairs of views together.
 
     `views` are RangeViews, or pairs of a Mesh and a camera position (3,), within a few centimetres and degrees of their
-    true poses. Larger errors need `landmarks` (per view one mapping name -> (3,) point, each name in at least two
-    views) or `features` (shape alone) to place them first. ValueError for no views.
+    true poses. Larger errors need `landmarks` to place them first: per view one mapping name -> (3,) point, each name
+    in at least two views. ValueError for no views.
     """
     config, rng = config or AlignViewsConfig(), np.random.default_rng(0)
     pairs = [mesh_and_camera(view) for view in views]
     if not pairs:
         raise ValueError("views: expected at least one, got none")
-    # rough poses first, where landmarks or features give them
-    start = np.tile(np.eye(4), (len(pairs), 1, 1))
+    # rough poses first, where landmarks give them
     if landmarks is not None:
         start = place_by_landmarks(landmarks, len(pairs))
-    elif features:
-        start = place_by_features(pairs, rng)
-    pairs = [_move(pair, T) for pair, T in zip(pairs, start, strict=True)]
+        pairs = [_move(pair, T) for pair, T in zip(pairs, start, strict=True)]
     # ICP over all pairs: match, solve for all motions together, tighten the reach
     samples = [_sample(mesh, rng) for mesh, _ in pairs]
     poses = np.tile(np.eye(4), (len(pairs), 1, 1))
@@ -89,7 +85,7 @@ def align_views(views: Sequence[Any], config: AlignViewsConfig | None = None,
     out = [_move(pair, T) for pair, T in zip(pairs, poses, strict=True)]
     overlap, conflict = fit_of_views(out)
     trusted = settled & (overlap >= config.min_overlap) & (conflict <= CONFLICT) | (len(out) == 1)
-    return AlignedViews(out, rms, settled, rounds, overlap, conflict, trusted)
+    return AlignedViews(out, rms, settled, overlap, conflict, trusted)
 
 
 def _move(view: tuple[Mesh, np.ndarray], T: np.ndarray) -> tuple[Mesh, np.ndarray]:
@@ -162,4 +158,4 @@ def views_problem(found: AlignedViews) -> str | None:
     if found.trusted.any():
         return None
     return (f"no view is in its place, they share {100 * float(found.overlap.max()):.0f}% of their surface at most; "
-            "the wrong cameras, another unit (--unit), or a start that is too far off (--landmarks, --by-shape)?")
+            "the wrong cameras, another unit (--unit), or a start that is too far off (--landmarks)?")

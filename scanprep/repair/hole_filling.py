@@ -3,7 +3,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any, Literal, NamedTuple, get_args
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -17,7 +17,6 @@ from .loops import group_loops, join_polygons
 from .manifold import repair, split_vertices
 from .volumetric_diffusion import EMPTY, diffuse_surface
 
-Method = Literal["auto", "fair", "diffusion"]
 MOST_EMPTY = 0.02                    # largest share of a good patch in free space; a worse one is tried again
 
 
@@ -27,10 +26,6 @@ class FillConfig(Settings):
 
     Attributes
     ----------
-    method : "auto", "fair" or "diffusion"
-        Fair patches, or patches pulled to a surface diffused through a volume. "auto" makes fair patches; where lines
-        of sight are known, it tries diffusion if a patch violates free space or intersects something. Without lines of
-        sight diffusion was never better on the holes that we measured, and it is slow.
     max_edges : int, optional
         Holes with longer borders stay open.
     join : bool
@@ -38,11 +33,10 @@ class FillConfig(Settings):
 
     Examples
     --------
-    >>> FillConfig(max_edges=200).method
-    'auto'
+    >>> FillConfig(max_edges=200).join
+    True
     """
 
-    method: Method = "auto"
     max_edges: Count | None = None
     join: bool = True
 
@@ -101,7 +95,7 @@ def fill_holes(mesh: Mesh, config: FillConfig | None = None,
     Raises
     ------
     ValueError
-        The mesh is empty or not manifold along its edges, or the method is unknown.
+        The mesh is empty or not manifold along its edges.
 
     Examples
     --------
@@ -121,8 +115,9 @@ def fill_report(mesh: Mesh, config: FillConfig | None = None, progress: Callable
                 views: Sequence[Any] = ()) -> FillReport:
     """Close the holes of a mesh and report how; like `fill_holes`.
 
-    Fair patches fill all holes together. Then holes with bad patches are filled one by one in a volume. `views` are
-    those that the mesh was merged from, RangeView or pairs (Mesh, camera position (3,)): their free space stays empty.
+    Fair patches fill all holes together. `views` are those that the mesh was merged from, RangeView or pairs (Mesh,
+    camera position (3,)): their free space stays empty. With them, holes with bad patches are filled one by one in a
+    volume. Without lines of sight diffusion was never better on the holes that we measured, and it is slow.
 
     [Liepa] triangulation, refinement, fairing
     [Davis] volumetric diffusion
@@ -130,8 +125,6 @@ def fill_report(mesh: Mesh, config: FillConfig | None = None, progress: Callable
     config = config or FillConfig()
     if not len(mesh.faces):
         raise ValueError("mesh: expected a surface with holes, got one without triangles")
-    if config.method not in get_args(Method):
-        raise ValueError(f"config.method: expected one of {', '.join(get_args(Method))}, got {config.method!r}")
     if not mesh.is_edge_manifold:
         raise ValueError("mesh: expected at most two triangles at an edge, facing the same way; repair it first")
     # find the borders, and group those that one patch joins
@@ -140,15 +133,11 @@ def fill_report(mesh: Mesh, config: FillConfig | None = None, progress: Callable
     if not loops:
         return FillReport(split_vertices(mesh), ())
     groups = group_loops(mesh, loops) if config.join else [[loop] for loop in loops]
-    work = _Filling(mesh, config, SeenSpace(views) if len(views) else None, Rays(mesh))
-    # fair patches for all holes; those with a bad patch, or all if only diffusion is asked for, are left open
-    fair = list[FilledHole | None]([None] * len(groups))
-    filled = mesh
-    if config.method != "diffusion":
-        filled = work.fair_patches(mesh, groups, progress=progress)
-        fair = [*work.rate(filled, mesh, groups, "fair")]
-    retry_bad = config.method == "auto" and len(views) > 0
-    done = {g: hole for g, hole in enumerate(fair) if hole is not None and not (retry_bad and hole.is_bad)}
+    work = _Filling(mesh, SeenSpace(views) if len(views) else None, Rays(mesh))
+    # fair patches for all holes; with lines of sight, those with a bad patch are left open
+    filled = work.fair_patches(mesh, groups, progress=progress)
+    fair = work.rate(filled, mesh, groups, "fair")
+    done = {g: hole for g, hole in enumerate(fair) if not len(views) or not hole.is_bad}
     if 0 < len(done) < len(groups):
         filled = work.fair_patches(mesh, [groups[g] for g in done])
     elif not done:
@@ -192,7 +181,6 @@ class _Filling:
     """Makes patches for the holes of one mesh, and rates them."""
 
     mesh: Mesh
-    config: FillConfig
     seen: SeenSpace | None
     rays: Rays
 
@@ -223,8 +211,7 @@ class _Filling:
             patch.untangle(start)
         return patch.onto(mesh, used)
 
-    def diffuse(self, mesh: Mesh, group: list[np.ndarray], fair: FilledHole | None
-                ) -> tuple[Mesh, FilledHole]:
+    def diffuse(self, mesh: Mesh, group: list[np.ndarray], fair: FilledHole) -> tuple[Mesh, FilledHole]:
         """Fill one hole by diffusion, unless the fair patch is better.
 
         [Davis] volumetric diffusion
@@ -238,7 +225,7 @@ class _Filling:
         guide = diffuse_surface(part, np.searchsorted(used, np.unique(rim)), self.seen)
         filled = self.fair_patches(mesh, [group], guide)
         diffused = self.rate(filled, mesh, [group], "diffusion")[0]
-        if fair is None or diffused.faults < fair.faults:
+        if diffused.faults < fair.faults:
             return filled, diffused
         return self.fair_patches(mesh, [group]), fair
 

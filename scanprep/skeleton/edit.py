@@ -4,11 +4,10 @@ A file of edits is JSON, a list carried out from the first to the last:
 
     [{"merge": ["chest", "shoulder_left"]},
      {"rename": {"part3": "neck"}},
-     {"move_joint": "neck", "position": [0.0, 0.02, 1.43]},
-     {"move_joint": "hand_left", "ring": [8120, 8131, 8140]}]
+     {"move_joint": "neck", "position": [0.0, 0.02, 1.43]}]
 
 Parts are given by name or by number; numbers are those of the skeleton at that entry. Positions are in metres on the
-template. A ring is a list of its vertices; the joint moves to its centre.
+template.
 """
 from __future__ import annotations
 
@@ -22,7 +21,6 @@ import numpy as np
 
 from ..geometry import storage
 from ..geometry.mesh import Mesh
-from .joints import ring_centre
 from .tree import Skeleton
 
 
@@ -99,22 +97,17 @@ def rename_part(skeleton: Skeleton, part: int | str, name: str) -> Skeleton:
     return replace(skeleton, names=tuple(name if j == p else old for j, old in enumerate(skeleton.names)))
 
 
-def move_joint(skeleton: Skeleton, template: Mesh, part: int | str, position: Sequence[float] | None = None,
-               ring: Sequence[int] | None = None) -> Skeleton:
+def move_joint(skeleton: Skeleton, part: int | str, position: Sequence[float]) -> Skeleton:
     """Move the joint between a part and its parent.
 
     Parameters
     ----------
     skeleton : Skeleton
         The skeleton to edit.
-    template : Mesh
-        Its template.
     part : str or int
         Name or number of the part.
-    position : (3,) float, metres, optional
+    position : (3,) float, metres
         New position on the template.
-    ring : (n,) int, optional
-        Instead of a position: vertices of the template, at whose centre the joint is placed.
 
     Returns
     -------
@@ -123,26 +116,16 @@ def move_joint(skeleton: Skeleton, template: Mesh, part: int | str, position: Se
     Raises
     ------
     ValueError
-        The root, which has no joint; both or none of `position` and `ring`; an invalid position or vertex.
+        The root, which has no joint, or an invalid position.
     """
     p = find_part_number(skeleton, part)
     if p == 0:
         raise ValueError(f"part: '{skeleton.names[0]}' is the root, its joint is the middle of its vertices")
-    if (position is None) == (ring is None):
-        raise ValueError("position, ring: expected one of the two")
+    point = np.asarray(position, dtype=np.float64)
+    if point.shape != (3,) or not np.isfinite(point).all():
+        raise ValueError(f"position: expected three finite numbers, got {position}")
     joints = skeleton.joints.copy()
-    if ring is not None:
-        vertices = np.asarray(ring)
-        n = len(template.vertices)
-        whole = vertices.ndim == 1 and len(vertices) >= 3 and np.issubdtype(vertices.dtype, np.integer)
-        if not whole or vertices.min() < 0 or vertices.max() >= n:
-            raise ValueError(f"ring: expected at least three vertices of 0..{n - 1}, got {list(ring)}")
-        joints[p] = ring_centre(template, vertices)
-    else:
-        point = np.asarray(position, dtype=np.float64)
-        if point.shape != (3,) or not np.isfinite(point).all():
-            raise ValueError(f"position: expected three finite numbers, got {position}")
-        joints[p] = point
+    joints[p] = point
     return replace(skeleton, joints=joints)
 
 
@@ -189,7 +172,7 @@ def read_edits(path: str | Path) -> list[dict[str, Any]]:
 def _apply(skeleton: Skeleton, template: Mesh, edit: dict[str, Any]) -> Skeleton:
     """Apply one entry of a list of edits."""
     # every action with the extra keys that it takes
-    known = {"merge": set(), "rename": set(), "move_joint": {"position", "ring"}}
+    known = {"merge": set(), "rename": set(), "move_joint": {"position"}}
     if not isinstance(edit, dict):
         raise ValueError(f"expected an object with one of {', '.join(known)}")
     asked = [action for action in known if action in edit]
@@ -206,7 +189,9 @@ def _apply(skeleton: Skeleton, template: Mesh, edit: dict[str, Any]) -> Skeleton
             raise ValueError(f"merge: expected a list of two parts, got {what!r}")
         return merge_parts(skeleton, template, *what)
     if action == "move_joint":
-        return move_joint(skeleton, template, what, edit.get("position"), edit.get("ring"))
+        if "position" not in edit:
+            raise ValueError("move_joint: expected a position")
+        return move_joint(skeleton, what, edit["position"])
     if not isinstance(what, dict):
         raise ValueError(f"rename: expected {{old: new}}, got {what!r}")
     for old, new in what.items():

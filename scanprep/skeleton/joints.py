@@ -339,15 +339,6 @@ def _meeting_point(dR: np.ndarray, gap: np.ndarray, radius: float) -> np.ndarray
     return c
 
 
-def ring_centre(template: Mesh, ring: np.ndarray) -> np.ndarray:
-    """Return the centre (3,) of a ring of vertices, metres, weighted by the length of its edges."""
-    inside = np.isin(template.edges, ring).all(axis=1)
-    if not inside.any():
-        return template.vertices[ring].mean(axis=0)
-    return np.average(template.vertices[template.edges[inside]].mean(axis=1), axis=0,
-                      weights=template.edge_lengths[inside])
-
-
 def middle_part(areas: np.ndarray, centres: np.ndarray, links: np.ndarray, joints: np.ndarray) -> int:
     """Find the part nearest to the rest of the body, by path lengths through the joints, weighted by areas (P,)."""
     P = len(areas)

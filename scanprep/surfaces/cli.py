@@ -8,7 +8,7 @@ from typing import Annotated
 import numpy as np
 
 from ..alignment.views import AlignViewsConfig, align_views, views_doubts, views_problem
-from ..arguments import Called, Place, UsageError
+from ..arguments import Place, UsageError
 from ..cleaning.clean_scan import CleanScanConfig, clean_scan
 from ..cli import MM, MeshArg, Output, PersonUnit, ScanArg, Unit, about_mesh
 from ..console import Metric, Outcome, bar
@@ -175,18 +175,17 @@ def clean(scan: ScanArg, output: Output, landmarks: Path | None = None, unit: Pe
 
 
 def align_cameras(views: ViewsArg, output: Output, landmarks: Path | None = None,
-                  features: Annotated[bool, Called("--by-shape")] = False, unit: Unit | None = None,
+                  unit: Unit | None = None,
                   config: AlignViewsConfig = AlignViewsConfig()) -> Outcome:
     """Bring range views into one frame, all of them together.
 
     Example: scape prep views views -o aligned
 
     Args:
-        views: Folder of range meshes, roughly in one frame unless landmarks or features place them, and cameras.json:
+        views: Folder of range meshes, roughly in one frame unless landmarks place them, and cameras.json:
             {file name without ending: [x, y, z]}, each in the frame of its view.
         output: Folder for the moved meshes and their cameras.json.
         landmarks: Folder of landmark files with the names of the views, which place them first.
-        features: Place the views by their shapes alone first.
         unit: Unit of the views, cameras and landmarks.
         config: Settings.
     """
@@ -195,17 +194,15 @@ def align_cameras(views: ViewsArg, output: Output, landmarks: Path | None = None
         names.append(name_of(path))
         beside = landmarks_beside(path, landmarks) if landmarks else None
         marks.append(read_landmarks(beside, mesh, unit) if beside else {})
-    found = align_views(seen, config, landmarks=marks if landmarks else None, features=features)
+    found = align_views(seen, config, landmarks=marks if landmarks else None)
     placed = dict(zip(names, found.views, strict=True))
     for name, (mesh, _) in placed.items():
         write_mesh(output / f"{name}.ply", mesh)
     storage.write_json(output / "cameras.json", {name: camera.tolist() for name, (_, camera) in placed.items()})
-    shifts = [float(np.linalg.norm(new - old)) for (_, new), (_, old) in zip(found.views, seen, strict=True)]
     doubts = views_doubts(found, names)
     return Outcome(output, [
         Metric("views", len(seen)), Metric("distance between views, RMS", MM * found.rms, "mm"),
-        Metric("rounds", found.iterations), Metric("converged", str(found.converged)),
-        Metric("largest shift of a camera", MM * max(shifts), "mm"),
+        Metric("converged", str(found.converged)),
         Metric("seen by others too, least of a view", 100 * float(found.overlap.min()), "%"),
         Metric("looked through by others, most of a view", 100 * float(found.conflict.max()), "%")],
                    {"views": config}, doubts,

@@ -188,8 +188,8 @@ def share_lost(scanned: Mesh, template: Mesh) -> float:
 def views_without_cameras(views: Sequence[Mesh | PointCloud]) -> PointCloud:
     """Align range views without known cameras; return their points and normals as one cloud.
 
-    Views within a few centimetres and degrees of their true poses are aligned directly, others first by shape.
-    ValueError for a view that overlaps too little with the others.
+    They must lie within a few centimetres and degrees of their true poses. ValueError for a view that overlaps too
+    little with the others.
     """
     placed = []
     for view in views:
@@ -200,9 +200,6 @@ def views_without_cameras(views: Sequence[Mesh | PointCloud]) -> PointCloud:
             placed.append(mesh_of_view(view))
     aligned = align_views(placed)
     apart = aligned.overlap < AlignViewsConfig().min_overlap
-    if len(views) > 1 and apart.any():
-        aligned = align_views(placed, features=True)
-        apart = aligned.overlap < AlignViewsConfig().min_overlap
     if len(views) > 1 and apart.any():
         raise ValueError(f"view {int(apart.argmax()) + 1} shares {100 * aligned.overlap.min():.0f}% of its surface "
                          "with the others; views need about a fifth in common: leave it out, or align the views first "

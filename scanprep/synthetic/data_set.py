@@ -12,7 +12,7 @@ from ..geometry import storage
 from ..geometry.mesh import Mesh
 from .landmarks import landmarks as landmark_vertices
 from .people import NAMED_POSES, BodyShape, SyntheticPerson, find_pose, mirror_synthetic_pose, random_pose
-from .scanner import RangeView, Scan, ScannerConfig, scan
+from .scanner import Scan, ScannerConfig, scan
 
 VERSION = 2                          # version 1 had other people, whose betas mean nothing here
 
@@ -80,19 +80,17 @@ def click_landmarks(truth: GroundTruth, rng: np.random.Generator, error: float =
 
 
 def write_scan(folder: str | Path, name: str, scanned: Scan, truth: GroundTruth | None = None,
-               landmarks: dict[str, np.ndarray] | None = None, views: bool = True) -> Path:
+               landmarks: dict[str, np.ndarray] | None = None) -> Path:
     """Write a scan: `name.ply` with the triangles of all views, and beside it what is known of it.
 
-    Landmarks go to `name.landmarks.json`, the views to `views/name.npz`, the truth to `truth/name.npz`. The PLY is
-    written last: if it exists, the rest does too.
+    Landmarks go to `name.landmarks.json`, the truth to `truth/name.npz`. The PLY is written last: if it exists, the
+    rest does too.
     """
     from ..geometry.files import write_mesh
 
     folder = Path(folder)
     if truth is not None:
         truth.save(folder / "truth" / f"{name}.npz")
-    if views:
-        _write_views(folder / "views" / f"{name}.npz", scanned)
     if landmarks is not None:
         storage.write_json(folder / f"{name}.landmarks.json",
                            {key: np.round(point, 6).tolist() for key, point in landmarks.items()})
@@ -100,32 +98,6 @@ def write_scan(folder: str | Path, name: str, scanned: Scan, truth: GroundTruth 
     with storage.writing(path) as beside:
         write_mesh(beside, scanned.merged)
     return path
-
-
-def _write_views(path: Path, scanned: Scan) -> None:
-    """Write the views of a scan."""
-    arrays = {}
-    for k, view in enumerate(scanned.views):
-        arrays.update({f"points{k}": view.points, f"faces{k}": view.mesh.faces, f"normals{k}": view.normals,
-                       f"T_world_camera{k}": view.T_world_camera, f"depth{k}": view.depth,
-                       f"intrinsics{k}": view.intrinsics})
-    storage.save(path, "range views", VERSION, arrays, {"views": len(scanned.views)})
-
-
-def read_views(path: str | Path) -> list[RangeView]:
-    """Read the views of one scan, from `views/name.npz`."""
-    header, a = storage.load(path, "range views", (VERSION,))
-    with storage.taking_apart(path, "whole range views"):
-        return [_view(a, k) for k in range(header["views"])]
-
-
-def _view(a: dict[str, np.ndarray], k: int) -> RangeView:
-    """Build view k from the arrays of a file."""
-    mesh = Mesh(storage.numbers(a, f"points{k}", None, 3), storage.numbers(a, f"faces{k}", None, 3))
-    T = storage.numbers(a, f"T_world_camera{k}", 4, 4)
-    return RangeView(mesh, storage.numbers(a, f"normals{k}", len(mesh.vertices), 3), T[:3, 3], T,
-                     storage.numbers(a, f"depth{k}", None, None, finite=False),
-                     storage.numbers(a, f"intrinsics{k}", 3, 3))
 
 
 @dataclass(frozen=True)
@@ -147,11 +119,6 @@ class SyntheticScan:
     def landmarks(self) -> Path:
         """Return the file of the landmarks."""
         return self.folder / f"{self.name}.landmarks.json"
-
-    @property
-    def views(self) -> Path:
-        """Return the file of the views."""
-        return self.folder / "views" / f"{self.name}.npz"
 
     @property
     def truth(self) -> Path:

@@ -8,8 +8,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from implicit_surface import Bump, Ellipsoid, Field, Group, Mirrored, RoundCone, project
-from polygonise import polygonise
+from implicit_surface import Bump, Ellipsoid, Field, Group, Mirrored, RoundCone, polygonise, project
 
 from scanprep.geometry.mesh import Mesh
 

@@ -22,7 +22,7 @@ from scanprep.fusion.tsdf import merge_views
 from scanprep.geometry import rotations
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.surface import Surface
-from scanprep.repair.hole_filling import FillConfig, fill_report
+from scanprep.repair.hole_filling import fill_report
 from scanprep.repair.intersections import intersecting_faces
 from scanprep.synthetic.scanner import RangeView, scan
 
@@ -83,8 +83,7 @@ def merging(data: RealData, bodies: list[tuple[str, int]]) -> list[dict[str, obj
             "known cameras": lambda pairs=pairs: pairs,
             "4 degrees, 4 cm off": lambda pairs=pairs, rng=rng: aligned(knocked(pairs, 4, 0.04, rng)),
             "10 degrees, 10 cm off": lambda pairs=pairs, rng=rng: aligned(knocked(pairs, 10, 0.10, rng)),
-            "unknown, landmarks": lambda pairs=pairs, marks=marks, rng=rng: aligned(*lost(pairs, marks, rng)),
-            "unknown, features": lambda pairs=pairs, rng=rng: aligned(knocked(pairs, 120, 1.0, rng), features=True)}
+            "unknown, landmarks": lambda pairs=pairs, marks=marks, rng=rng: aligned(*lost(pairs, marks, rng))}
         for way, make in ways.items():
             start = time.process_time()
             try:
@@ -103,22 +102,22 @@ def merging(data: RealData, bodies: list[tuple[str, int]]) -> list[dict[str, obj
     return rows
 
 
-def aligned(views: list[tuple[Mesh, np.ndarray]], features: bool = False,
-            landmarks: list[dict[str, np.ndarray]] | None = None) -> list[tuple[Mesh, np.ndarray]] | None:
+def aligned(views: list[tuple[Mesh, np.ndarray]], landmarks: list[dict[str, np.ndarray]] | None = None
+            ) -> list[tuple[Mesh, np.ndarray]] | None:
     """The views brought together, or None when the alignment says that it failed."""
-    result = align_views(views, features=features, landmarks=landmarks)
+    result = align_views(views, landmarks=landmarks)
     return result.views if result.trusted.all() else None
 
 
 def lost(views: list[tuple[Mesh, np.ndarray]], marks: list[dict[str, np.ndarray]], rng: np.random.Generator
-         ) -> tuple[list[tuple[Mesh, np.ndarray]], bool, list[dict[str, np.ndarray]]]:
+         ) -> tuple[list[tuple[Mesh, np.ndarray]], list[dict[str, np.ndarray]]]:
     """Views in frames of their own, except the first, with the landmarks that were clicked on each."""
     moved, clicked = [], []
     for number, ((mesh, camera), points) in enumerate(zip(views, marks, strict=True)):
         R, t = rotations.exp(2 * rng.normal(size=3) * (number > 0)), rng.normal(size=3) * (number > 0)
         moved.append((mesh.with_vertices(mesh.vertices @ R.T + t), R @ camera + t))
         clicked.append({name: R @ point + t for name, point in points.items()})
-    return moved, False, clicked
+    return moved, clicked
 
 
 def merge_peers(views: list[RangeView], truth: Mesh) -> Iterator[tuple[str, dict[str, object]]]:
@@ -148,11 +147,7 @@ def merge_peers(views: list[RangeView], truth: Mesh) -> Iterator[tuple[str, dict
 
 def fillers() -> dict[str, Callable[[Mesh], tuple[Mesh, bool]]]:
     """Name -> function to a filled mesh and whether the triangles of the old one come first in it."""
-    def ours(method: str) -> Callable[[Mesh], tuple[Mesh, bool]]:
-        return lambda mesh: (fill_report(mesh, FillConfig(method=method)).mesh, True)     # type: ignore[arg-type]
-
-    found = {f"scapekit {method}": ours(method) for method in ("auto", "fair", "diffusion")}
-    found["trimesh fill_holes"] = trimesh_fill
+    found = {"scapekit": lambda mesh: (fill_report(mesh).mesh, True), "trimesh fill_holes": trimesh_fill}
     try:
         import open3d  # noqa: F401
 
