@@ -16,7 +16,7 @@ from model import find_tapes, measure
 from model.measurement.catalogue import CATALOGUE
 from model.measurement.survey import ordinal, percentiles
 from scanprep import Mesh, RegisteredSet, read_mesh, write_mesh
-from scanprep.decimation.decimate import fast_collapses
+from scanprep.decimation.decimate import decimate
 from scanprep.geometry.landmark_names import landmark_name, translate_landmarks
 from scanprep.judgement import Judgement
 from scanprep.synthetic.landmarks import landmarks
@@ -278,7 +278,7 @@ def test_measures_that_contradict_each_other_or_everybody(tmp_path, capsys, word
 def test_a_lone_body_of_foreign_triangles_is_measured(tmp_path, sex, weight):
     """Nobody named a landmark: tapes lie where they lie on the same body in triangles that are known, also if fat."""
     person = SyntheticPerson(BodyShape.like(sex, weight=weight)).mesh
-    remeshed = fast_collapses(person, 24000)
+    remeshed = decimate(person, 24000)
     order = np.random.default_rng(1).permutation(len(remeshed.vertices))
     write_mesh(tmp_path / "body.ply", Mesh(remeshed.vertices[order], np.argsort(order)[remeshed.faces]))
     assert scape(tmp_path / "body.ply", "-o", tmp_path / "m.csv") == 0

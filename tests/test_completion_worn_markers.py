@@ -8,7 +8,6 @@ from completion_bodies import MARKS, POSE, QUICK, TRANS, worm_with_prior
 from config_files import config_file
 
 from completion.__main__ import main
-from completion.mocap.files.markers import MarkerSequence, write_markers
 from completion.mocap.marker_sets.named import read_layout
 from completion.partial import report
 from completion.partial.interactive import CompleteApp
@@ -37,11 +36,11 @@ def worn():
     return model, body, dict(zip(LABELS, points, strict=True)), np.einsum("nk,nkd->nd", bary, corners)
 
 
-def app_of(worn, folder):
+def app_of(worn, folder, labels=()):
     model, body, _, _ = worn
     write_mesh(folder / "person.ply", body)
     work = CompletionTask(model, "worm", dict(zip(NAMES, map(int, MARKS), strict=True)), QUICK)
-    app = CompleteApp(model, work, [folder / "person.ply"], folder / "out")
+    app = CompleteApp(model, work, [folder / "person.ply"], folder / "out", labels)
     app.scan.places.update({name: body.vertices[v] for name, v in zip(NAMES, MARKS, strict=True)})
     return app
 
@@ -69,9 +68,10 @@ def test_markers_are_clicked_beside_the_landmarks_and_saved_as_a_layout(worn, tm
     with workspace(tmp_path / "out"):
         sent(app, "save")
     assert not (tmp_path / "out" / "layout.json").exists() and app.greet()[1].fields["markers"] == 0
-    write_markers(tmp_path / "walk.csv", MarkerSequence(np.zeros((2, 12, 3)) + np.arange(12)[:, None], LABELS, 100.0))
-    app.receive("walk.csv", tmp_path / "walk.csv", lambda message: None)
-    assert app.names[-12:] == LABELS and len(app.scans) == 1
+    app = app_of(worn, tmp_path, LABELS)
+    assert {*LABELS, *NAMES} == set(app.names) and len(app.scans) == 1
+    sent(app, "choose", name=LABELS[0])
+    sent(app, "complete")
     for name, place in worn[2].items():
         assert app.chosen == name                                     # one after the other
         sent(app, "place", pane=1, name=name, origin=place.tolist(), direction=[0, 0, 1], seen=place.tolist())
@@ -83,7 +83,6 @@ def test_markers_are_clicked_beside_the_landmarks_and_saved_as_a_layout(worn, tm
     assert_there(worn, tmp_path / "out" / "layout.json")
     rows = {m["metric"]: m["value"] for m in json.loads((tmp_path / "out" / "report.json").read_text())["metrics"]}
     assert rows["markers clicked"] == 12 and rows["landmarks used"] == len(MARKS)
-    app.close()
 
 
 def test_the_command_does_the_same(worn, tmp_path):

@@ -53,8 +53,8 @@ def test_functions_take_meshes_of_other_libraries(tmp_path):
     assert len(decimate(mesh=theirs, faces=2000).faces) == 2000
     assert clean_scan(theirs).judgement.verdict == "good"
     write_mesh(tmp_path / "body.ply", theirs)
-    with pytest.raises(ValueError, match="method"):
-        register(theirs, theirs, config=SimpleNamespace(method="none"))
+    with pytest.raises(ValueError, match="landmarks: expected at least"):
+        register(theirs, theirs, (np.zeros(1, dtype=int), np.zeros((1, 3))))
 
 
 @pytest.mark.parametrize("package", PACKAGES)
