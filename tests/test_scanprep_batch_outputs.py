@@ -147,16 +147,6 @@ def test_files_that_differ_in_their_endings_keep_their_reports(tmp_path):
     assert len(os.listdir(tmp_path)) == 4
 
 
-def test_a_report_without_the_ending_still_tells_what_is_ours(tmp_path):
-    """As they were named once: of the file that they name, and of no other."""
-    assert command(write_alone, tmp_path / "a.txt") == 0
-    (tmp_path / "a.txt.report.json").rename(tmp_path / "a.report.json")
-    (tmp_path / "a.md").write_text("mine")
-    assert command(write_alone, tmp_path / "a.md") == 1 and (tmp_path / "a.md").read_text() == "mine"
-    assert command(write_alone, tmp_path / "a.txt", "--text", "other") == 0
-    assert sorted(os.listdir(tmp_path)) == ["a.md", "a.txt", "a.txt.report.json"]
-
-
 @dataclass(frozen=True)
 class Refuse:
     works: bool

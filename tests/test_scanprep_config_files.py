@@ -176,7 +176,7 @@ def test_the_preset_of_every_command_is_in_force(prog):
     name, usual = next(iter(values.items()))
     paper = type(usual).from_paper()
     own = {f.name for f in dataclasses.fields(usual) if getattr(usual, f.name) != getattr(type(usual)(), f.name)}
-    assert found.presets and found.values[name] != usual and own <= {"displacement"}
+    assert found.presets and found.values[name] != usual and own <= {"size"}
     for field in dataclasses.fields(usual):
         source = usual if field.name in own else paper
         assert getattr(found.values[name], field.name) == getattr(source, field.name)

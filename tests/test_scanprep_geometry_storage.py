@@ -8,18 +8,6 @@ import pytest
 from scanprep.geometry import storage, tables
 from scanprep.geometry.storage import StorageError
 
-ARRAYS = {"a": np.arange(6.0).reshape(2, 3), "b": np.array([], dtype=np.int64), "c": np.array(["x", "yz"])}
-
-
-def test_arrays_and_header_come_back(tmp_path):
-    storage.save(tmp_path / "deep" / "m.npz", "model", 3, ARRAYS, {"name": "é", "list": [1, None]})
-    header, arrays = storage.load(tmp_path / "deep" / "m.npz", "model", (2, 3))
-    assert header == {"kind": "model", "version": 3, "name": "é", "list": [1, None]}
-    assert set(arrays) == set(ARRAYS)
-    for name, value in ARRAYS.items():
-        np.testing.assert_array_equal(arrays[name], value)
-        assert arrays[name].dtype == value.dtype
-
 
 def test_no_objects_go_in_and_no_pickle_is_loaded(tmp_path):
     with pytest.raises(ValueError, match=r"m\.npz: .*a holds objects"):
