@@ -57,20 +57,14 @@ def slicer(points, system, unit="mm", scale=1000):
         + [{"label": "F-9", "position": [0, 0, 0], "positionStatus": "undefined"}]}]}
 
 
-def fiducials(points, system, columns=True):
+def fiducials(points, system):
     """As 3D Slicer 4 and 5 write them; the last two numbers are of version 5, and say that the last is not placed."""
     turn = np.array([1, 1, 1]) if system in ("LPS", "1") else np.array([-1, -1, 1])
     rows = [f"vtkMRMLMarkupsFiducialNode_{i},{','.join(map(str, 1000 * turn * p))},0,0,0,1,1,1,0,\"{name}\",,,2,0\n"
             for i, (name, p) in enumerate(points.items())]
     return ("# Markups fiducial file version = 4.11\n" + f"# CoordinateSystem = {system}\n" * bool(system)
-            + "# columns = id,x,y,z,ow,ox,oy,oz,vis,sel,lock,label,desc,associatedNodeID\n" * columns
+            + "# columns = id,x,y,z,ow,ox,oy,oz,vis,sel,lock,label,desc,associatedNodeID\n"
             + "".join(rows) + "9,0,0,0,0,0,0,1,1,1,0,F-9,,,0,0\n")
-
-
-def fiducials_3(points):
-    """A fiducial list of 3D Slicer 3, always in RAS."""
-    rows = "".join(f"{name},{-1000 * x},{-1000 * y},{1000 * z},1,1\n" for name, (x, y, z) in points.items())
-    return f"# Fiducial List file F.fcsv\n# version = 2\n# numPoints = 3\n# columns = label,x,y,z,sel,vis\n{rows}"
 
 
 def scalismo(points):
@@ -94,7 +88,6 @@ FORMS = [("a.json", POINTS), ("a.pp", picked(POINTS)), ("a.lnd", caesar(POINTS))
          ("a.mrk.json", slicer(POINTS, "LPS")), ("b.mrk.json", slicer(POINTS, "RAS")),
          ("c.mrk.json", slicer(POINTS, "LPS", "m", 1)), ("d.mrk.json", slicer(POINTS, "LPS", ["cm"] * 3, 100)),
          *((f"{system or 'none'}.fcsv", fiducials(POINTS, system)) for system in ("LPS", "RAS", "0", "1", "")),
-         ("no_columns.fcsv", fiducials(POINTS, "LPS", False)), ("slicer3.fcsv", fiducials_3(POINTS)),
          ("a.scalismo.json", scalismo(POINTS)), ("scalismo.json", scalismo(POINTS)), ("a.csv", table(POINTS)),
          ("b.csv", table(POINTS, "Label;X;Y;Z", ";")), ("a.xml", marker_set(POINTS)),
          ("b.xml", marker_set(POINTS, "<body>torso</body>"))]
@@ -245,8 +238,8 @@ def test_vertices_come_back_and_what_is_no_point_is_not_written(tmp_path):
     ("a.txt", "0 0 1 nose\n0 0 1\n", ["line 2", "x y z name"]),
     ("a.txt", "0 0 1 nose\n0 0 2 nose\n", ["'nose' comes twice"]),
     ("a.fcsv", fiducials(POINTS, "IJK"), ["CoordinateSystem", "IJK"]),
-    ("a.fcsv", fiducials_3(POINTS).replace("-100.0", "nan"), ["line 5", "label,x,y,z", "nan"]),
-    ("a.fcsv", "# CoordinateSystem = LPS\nnose,1,2\n", ["line 2", "label,x,y,z"]),
+    ("a.fcsv", fiducials(POINTS, "LPS").replace("1600.0", "nan"), ["line 4", "expected id,x,y,z"]),
+    ("a.fcsv", "# CoordinateSystem = LPS\nnose,1,2,3\n", ["# columns = id,x,y,z"]),
     ("a.csv", "nose,0,0,1\n", ["line 1", "heading with name, x, y, z"]),
     ("a.csv", "name,x,y,z\nnose,0,0,nan\n", ["line 2", "nan"]),
     ("a.scalismo.json", [{"id": "nose", "coordinates": [1, 2]}], ["'nose'", "[1, 2]"]),
