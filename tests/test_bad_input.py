@@ -139,19 +139,6 @@ def test_one_clear_line(place, capsys, case):
     assert sorted(place.rglob("*")) == before
 
 
-@pytest.mark.slow
-def test_the_good_files_are_good(place, capsys):
-    """Or the cases above would prove nothing."""
-    assert main(COMPLETE.split()) == 0
-    assert main(ANIMATE.replace("-o out", "-o out2").split()) == 0
-    assert {"completed.ply", "predicted.ply", "completion.npz", "picture.png", "report.html", "report.json"} == {
-        p.name for p in (place / "out").glob("[!.]*")}
-    assert {"motion.npz", "animation.glb", "motion.bvh", "motion.trc",
-            "joint_angles.csv", "joint_centres.csv", "residuals.csv",
-            "subject.json", "layout.json",
-            "report.html", "report.json"} == {p.name for p in (place / "out2").glob("[!.]*")}
-
-
 FULL, GONE = OSError(28, "No space left on device"), OSError(5, "Input/output error")
 
 
