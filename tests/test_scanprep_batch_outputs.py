@@ -4,10 +4,9 @@ import os
 from dataclasses import dataclass
 
 import pytest
-from trees import tree
+from trees import die_at_move, tree
 
 from scanprep import command_line
-from scanprep.batch import workspace as room
 from scanprep.batch.opening import FileWorkspace, beside
 from scanprep.batch.ownership import HOME
 from scanprep.batch.workspace import Task, Workspace
@@ -74,25 +73,9 @@ def test_an_output_file_that_is_not_ours_stays(tmp_path, capsys):
 
 @pytest.mark.parametrize("at", range(8))
 def test_a_command_killed_between_any_two_moves(tmp_path, monkeypatch, at):
-    out, calls, replace = tmp_path / "a.txt", [], os.replace
+    out = tmp_path / "a.txt"
     assert command(write, out) == 0
-
-    class Killed(BaseException):
-        pass
-
-    def moving(source, target):
-        calls.append(source)
-        if len(calls) == at + 1:
-            raise Killed
-        replace(source, target)
-
-    monkeypatch.setattr(os, "replace", moving)
-    monkeypatch.setattr(room.shutil, "rmtree", lambda *args, **named: None)
-    try:
-        command(write, out, "--text", "other")
-    except Killed:
-        pass
-    monkeypatch.undo()
+    die_at_move(monkeypatch, at, lambda: command(write, out, "--text", "other"))
     assert command(write, out, "--text", "other") == 0
     assert sorted(p.name for p in tmp_path.iterdir()) == ["a.more.txt", "a.txt", "a.txt.report.json"]
     assert out.read_text() == (tmp_path / "a.more.txt").read_text() == "other"

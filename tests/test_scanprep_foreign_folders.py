@@ -16,7 +16,7 @@ from model import load_model
 from model.importing import read_published
 from model.motion.files import read_motion_file
 from model.statue.detail.maps import read_edited
-from scanprep import Mesh, RegisteredSet, Skeleton, config_files, read_landmarks
+from scanprep import Mesh, RegisteredSet, Skeleton, config_files, read_landmarks, read_mesh
 from scanprep.batch.cluster import _outcome
 from scanprep.batch.digests import Digests
 from scanprep.batch.opening import beside, workspace
@@ -126,14 +126,15 @@ def test_a_new_result_follows_no_link_out_of_the_output(home):
 READERS = (load_model, read_published, read_camera, read_distances, read_landmarks, read_markers, Skeleton.load,
            MarkerLayout.load, read_motion_file, lambda path: read_mask(path, np.zeros((2, 3))),
            lambda path: config_files.read_settings(path, {}), small_picture, lambda path: read_names(str(path)),
-           lambda path: read_edited(path, (4, 4)))
+           lambda path: read_edited(path, (4, 4)), read_mesh, storage.load_arrays)
 
 
 @pytest.mark.parametrize("reader", READERS)
 def test_what_is_no_plain_file_is_refused_before_it_is_read(tmp_path, reader):
-    """A pipe that nobody writes to would be waited for without end."""
+    """A pipe that nobody writes to would be waited for without end, and a device read without one."""
     os.mkfifo(tmp_path / "pipe.npz")
-    for path in (tmp_path, tmp_path / "pipe.npz"):
+    (tmp_path / "device.npz").symlink_to("/dev/zero")
+    for path in (tmp_path, tmp_path / "pipe.npz", tmp_path / "device.npz"):
         with pytest.raises(ValueError, match=re.escape(str(path))):
             reader(path)
 

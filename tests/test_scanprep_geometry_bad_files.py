@@ -1,16 +1,13 @@
 """Bad files of meshes: one line with the name of the file, what was expected, what came."""
 import gzip
 import json
-import os
 import struct
 
 import numpy as np
 import pytest
 from mesh_files import PLY_HEADER, PLY_ROWS, TETRAHEDRON, body, refused
 
-from scanprep.geometry import storage
 from scanprep.geometry.files import read_mesh, read_points, write_mesh
-from scanprep.geometry.landmarks import read_landmarks
 
 
 @pytest.mark.parametrize("suffix", [".ply", ".ply.gz", ".obj", ".stl", ".off", ".glb"])
@@ -118,16 +115,6 @@ def test_a_glb_with_a_face_out_of_range_or_damaged_json(tmp_path):
     refused(tmp_path / "bad.glb", "componentType")
     (tmp_path / "bad.glb").write_bytes(data[:20] + b"{" * size + data[20 + size:])
     refused(tmp_path / "bad.glb", "JSON")
-
-
-@pytest.mark.parametrize("ending", [".ply", ".obj", ".json", ".npz"])
-def test_what_is_no_plain_file_is_refused_at_once(tmp_path, ending):
-    os.mkfifo(tmp_path / f"pipe{ending}")
-    (tmp_path / f"device{ending}").symlink_to("/dev/zero")
-    read = {".json": read_landmarks, ".npz": storage.load_arrays}.get(ending, read_mesh)
-    for name in ("pipe", "device"):
-        with pytest.raises(storage.StorageError, match=f"{name}{ending}: expected .*, found a pipe or a device"):
-            read(tmp_path / f"{name}{ending}")
 
 
 def test_lists_of_negative_length(tmp_path):

@@ -241,7 +241,8 @@ def test_a_folder_of_one_topology_is_read_sorted_by_name(tmp_path):
     (Mesh(np.r_[TETRAHEDRON.vertices, [[1, 1, 1.0]]], TETRAHEDRON.faces),
      ["4 vertices and 4 faces", "5 vertices and 4 faces"]),
     (Mesh(TETRAHEDRON.vertices, TETRAHEDRON.faces[[0, 1, 3, 2]]),
-     ["from face 2", "[1, 2, 3]", "[0, 3, 2]", "flipped"])])
+     ["from face 2", "[1, 2, 3]", "[0, 3, 2]", "flipped"]),
+    (Mesh(TETRAHEDRON.vertices, TETRAHEDRON.faces[:, [0, 2, 1]]), ["inside out"])])
 def test_a_folder_of_two_topologies_names_the_file_and_the_difference(tmp_path, other, words):
     write_mesh(tmp_path / "a.ply", TETRAHEDRON)
     write_mesh(tmp_path / "b.ply", other)
