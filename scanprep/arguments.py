@@ -162,7 +162,7 @@ class Argument:
                 beside = [p.name for p in path.parent.iterdir()] if path.parent.is_dir() else []
                 raise FileNotFoundError(f"{path}: no such file or folder{near(path.name, beside, 0.8)}")
 
-    def add_to(self, group: Any) -> argparse.Action:
+    def add_to(self, group: Any) -> None:
         """Add it to a group of argparse."""
         help_text = self.sentence.replace("%", "%%")
         if self.required and not self.place:
@@ -172,14 +172,15 @@ class Argument:
                 self.type in (int, float)):
             help_text += f" (default: {self.default})"
         if self.place:
-            return group.add_argument(self.name, nargs=self.nargs, metavar=self.metavar, help=help_text,
-                                      default=argparse.SUPPRESS)
+            group.add_argument(self.name, nargs=self.nargs, metavar=self.metavar, help=help_text,
+                               default=argparse.SUPPRESS)
+            return
         if self.type is bool:
             kind: dict[str, Any] = {"action": "store_true"}
         else:
             kind = {"nargs": self.nargs, "metavar": self.metavar,
                     "action": "append" if self.alias is not None and self.alias.each else "store"}
-        return group.add_argument(*self.flags, dest=self.name, help=help_text, default=argparse.SUPPRESS, **kind)
+        group.add_argument(*self.flags, dest=self.name, help=help_text, default=argparse.SUPPRESS, **kind)
 
 
 def _bare(annotation: Any) -> Any:
@@ -237,13 +238,8 @@ def command_sentences(function: Callable[..., Any]) -> tuple[str, dict[str, str]
     return text.strip(), {name: " ".join(sentence.split()) for name, sentence in entries}
 
 
-def make_parser(prog: str, text: str, arguments: Sequence[Argument],
-                extend: Callable[[Argument, argparse.Action], None] = lambda _argument, _action: None
-                ) -> argparse.ArgumentParser:
-    """Make the parser of a command. Values stay text, and nothing is required: `read_line` converts and checks.
-
-    `extend` is called with every argument and its action.
-    """
+def _make_parser(prog: str, text: str, arguments: Sequence[Argument]) -> argparse.ArgumentParser:
+    """Make the parser of a command. Values stay text, and nothing is required: `read_line` converts and checks."""
     widths = range(60, 101)  # characters of help: narrower breaks the table, wider is hard to read
     width = min(max(shutil.get_terminal_size().columns, widths[0]), widths[-1])
     # wrap paragraphs, but keep examples in one line, so that they can be copied
@@ -258,7 +254,7 @@ def make_parser(prog: str, text: str, arguments: Sequence[Argument],
     # argparse shows only groups that have arguments
     groups = {title: parser.add_argument_group(title) for title in GROUPS}
     for argument in arguments:
-        extend(argument, argument.add_to(groups[argument.group]))
+        argument.add_to(groups[argument.group])
     groups["other"].add_argument("-h", "--help", action="help", help="Show this and do nothing else.")
     return parser
 
@@ -293,7 +289,7 @@ def read_line(prog: str, text: str, arguments: Sequence[Argument], argv: Sequenc
     UsageError
         An unknown flag, with the most similar one; missing arguments, all of them; a value of another type.
     """
-    parser = make_parser(prog, text, arguments)
+    parser = _make_parser(prog, text, arguments)
     # behind -- there are files only, whatever they are called
     if "--" in argv:
         end = list(argv).index("--")

@@ -18,7 +18,7 @@ from shlex import quote
 from typing import Any
 
 from . import config_files, ranges
-from .arguments import Argument, UsageError, command_sentences, make_parser, near, read_line
+from .arguments import Argument, UsageError, command_sentences, near, read_line
 from .config_files import Flag
 from .console import JUDGEMENT, Metric, Outcome, keep_report, say, show, write_report
 from .interrupts import terminate_as_interrupt, tidy_up
@@ -169,10 +169,6 @@ class Arguments:
         if self.wants_space:                # other commands keep no results to compute again
             flags[FORCE] = Flag((), bool, False, "Do all anew, whatever is done already.")
         self.listed += [Argument(name, flag.annotation, flag.value, flag.sentence) for name, flag in flags.items()]
-
-    def parser(self, extend: Callable[[Argument, argparse.Action], None]) -> argparse.ArgumentParser:
-        """Return the parser that prints help; `extend` is called with every argument and its action."""
-        return make_parser(self.prog, self.text, self.listed, extend)
 
     def read(self, argv: list[str]) -> dict[str, Any]:
         """Read a command line and check the range of every number; nothing is run yet."""

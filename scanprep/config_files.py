@@ -6,7 +6,6 @@ the file; one with several has a table for each, named like the parameter of the
 from __future__ import annotations
 
 import dataclasses
-import difflib
 import inspect
 import re
 import textwrap
@@ -16,6 +15,7 @@ from collections.abc import Collection, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
+from .arguments import near
 from .geometry import storage
 from .ranges import FLAG, NO_FLAGS, OutOfRangeError, Settings, marks
 
@@ -173,8 +173,7 @@ class _Place:
     def check_name(self, name: str, known: Any, table: Path_, what: str) -> None:
         """Raise an error for an unknown name, with the most similar known one."""
         if name not in known:
-            near = difflib.get_close_matches(name, list(known), 1, 0.5)
-            names = f"; did you mean {near[0]}?" if near else f"; there are: {', '.join(known)}"
+            names = near(name, known, 0.5) or f"; there are: {', '.join(known)}"
             raise self.error(name, table, f"expected a {what} of this command{names}")
 
     def check_removed(self, names: Collection[str], table: Path_, owner: type | None = None) -> None:

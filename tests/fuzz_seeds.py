@@ -209,7 +209,8 @@ def _add_landmarks(body: Mesh, place: Any, add: Any, text: Any) -> None:
          lambda path: read_landmark_vertices(path, body), check)
     text("words.txt", "".join(f"{x} {y} {z} {n}\n" for n, x, y, z in rows),
          lambda path: read_landmarks(path, body), check)
-    text("slicer.fcsv", "# CoordinateSystem = LPS\n" + "".join(
+    columns = "# columns = id,x,y,z,ow,ox,oy,oz,vis,sel,lock,label,desc,associatedNodeID\n"
+    text("slicer.fcsv", "# CoordinateSystem = LPS\n" + columns + "".join(
         f"{i},{1e3 * x},{1e3 * y},{1e3 * z},0,0,0,1,1,1,0,{n},,\n" for i, (n, x, y, z) in enumerate(rows)),
          lambda path: read_landmarks(path, body), check)
     text("table.csv", "name,x,y,z\n" + "".join(f"{n},{x},{y},{z}\n" for n, x, y, z in rows),

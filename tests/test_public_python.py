@@ -14,7 +14,6 @@ from completion import (
     animate,
     joint_angles,
     joint_centres,
-    load_completion,
     load_layout,
     measure_completion,
     retarget,
@@ -82,12 +81,6 @@ def test_results_are_told_in_one_line(whole):
     for result in (fit, errors, measure_completion(whole), MODEL.subject(), posed):
         assert repr(result).startswith(type(result).__name__) and "\n" not in repr(result) and len(repr(result)) < 400
     assert "errors=Errors(0." in repr(errors)
-
-
-def test_a_completion_is_saved_and_read(whole, tmp_path):
-    again = load_completion(whole.save(tmp_path / "done"))
-    np.testing.assert_array_equal(again.pose, whole.pose)
-    assert again.judgement == whole.judgement
 
 
 def test_a_completion_is_measured_with_its_errors(whole):

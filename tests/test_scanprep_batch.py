@@ -10,11 +10,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from trees import tree
+from trees import die_at_move, tree
 
 from scanprep import Mesh
 from scanprep.batch import digests as digests_module
-from scanprep.batch import workspace as room
 from scanprep.batch.digests import Digests
 from scanprep.batch.opening import workspace
 from scanprep.batch.ownership import HOME, ForeignFileError
@@ -216,24 +215,7 @@ def test_killed_between_any_two_moves(tmp_path, texts, monkeypatch, at):
     copied(tmp_path, texts)
     for path in texts:
         path.write_text("changed " + path.name)
-    calls = []
-
-    class Killed(BaseException):
-        pass
-
-    def replace(source, target):
-        calls.append(source)
-        if len(calls) == at + 1:
-            raise Killed
-        os.rename(source, target)
-
-    monkeypatch.setattr(room.os, "replace", replace)
-    monkeypatch.setattr(room.shutil, "rmtree", lambda *args, **named: None)        # nobody tidies up
-    try:
-        copied(tmp_path, texts)
-    except Killed:
-        pass
-    monkeypatch.undo()
+    die_at_move(monkeypatch, at, lambda: copied(tmp_path, texts))
     done, made = copied(tmp_path, texts)
     assert not done.failures and made <= 3
     assert tree(tmp_path / "out") == {f"{p.stem}/copy.txt": f"CHANGED {p.name.upper()}!".encode() for p in texts}

@@ -4,10 +4,9 @@ import os
 from dataclasses import dataclass
 
 import pytest
-from trees import tree
+from trees import die_at_move, tree
 
 from scanprep import command_line
-from scanprep.batch import workspace as room
 from scanprep.batch.opening import FileWorkspace, beside
 from scanprep.batch.ownership import HOME
 from scanprep.batch.workspace import Task, Workspace
@@ -74,25 +73,9 @@ def test_an_output_file_that_is_not_ours_stays(tmp_path, capsys):
 
 @pytest.mark.parametrize("at", range(8))
 def test_a_command_killed_between_any_two_moves(tmp_path, monkeypatch, at):
-    out, calls, replace = tmp_path / "a.txt", [], os.replace
+    out = tmp_path / "a.txt"
     assert command(write, out) == 0
-
-    class Killed(BaseException):
-        pass
-
-    def moving(source, target):
-        calls.append(source)
-        if len(calls) == at + 1:
-            raise Killed
-        replace(source, target)
-
-    monkeypatch.setattr(os, "replace", moving)
-    monkeypatch.setattr(room.shutil, "rmtree", lambda *args, **named: None)
-    try:
-        command(write, out, "--text", "other")
-    except Killed:
-        pass
-    monkeypatch.undo()
+    die_at_move(monkeypatch, at, lambda: command(write, out, "--text", "other"))
     assert command(write, out, "--text", "other") == 0
     assert sorted(p.name for p in tmp_path.iterdir()) == ["a.more.txt", "a.txt", "a.txt.report.json"]
     assert out.read_text() == (tmp_path / "a.more.txt").read_text() == "other"
@@ -145,16 +128,6 @@ def test_files_that_differ_in_their_endings_keep_their_reports(tmp_path):
         assert (tmp_path / name).read_text() == name
         assert set(json.loads((tmp_path / f"{name}.report.json").read_text())["written"]) == {name}
     assert len(os.listdir(tmp_path)) == 4
-
-
-def test_a_report_without_the_ending_still_tells_what_is_ours(tmp_path):
-    """As they were named once: of the file that they name, and of no other."""
-    assert command(write_alone, tmp_path / "a.txt") == 0
-    (tmp_path / "a.txt.report.json").rename(tmp_path / "a.report.json")
-    (tmp_path / "a.md").write_text("mine")
-    assert command(write_alone, tmp_path / "a.md") == 1 and (tmp_path / "a.md").read_text() == "mine"
-    assert command(write_alone, tmp_path / "a.txt", "--text", "other") == 0
-    assert sorted(os.listdir(tmp_path)) == ["a.md", "a.txt", "a.txt.report.json"]
 
 
 @dataclass(frozen=True)

@@ -81,14 +81,6 @@ def test_help_answers_at_once():
     assert all(f"\n  {command} " in done.stdout for command in COMMANDS)
 
 
-def test_dask_is_loaded_for_a_scheduler_alone(place):
-    code = (f"import sys\nsys.path.insert(0, {str(ROOT)!r})\nimport scanprep.pipeline.prepare\n"
-            "from completion.__main__ import main\nmain(['prep', 'page', 'set'])\n"
-            "assert 'distributed' not in sys.modules and 'dask' not in sys.modules")
-    done = subprocess.run([sys.executable, "-c", code], cwd=place, capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr
-
-
 def test_run(place, tmp_path, capsys, quick):
     (place / "scans" / "broken.ply").write_text("nothing")
     code = run("run", place / "scans", "--template", place / "template.ply", "-o", tmp_path / "set", "--config", quick)

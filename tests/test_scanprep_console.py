@@ -6,7 +6,6 @@ import signal
 import subprocess
 import sys
 import time
-import warnings
 from pathlib import Path
 from typing import Annotated
 
@@ -43,29 +42,6 @@ def test_done(tmp_path, capsys):
     assert {"numpy", "python", "machine"} <= set(report["versions"])
 
 
-def test_failed_is_one_line(tmp_path, capsys):
-    assert command_line.run(work, "scape work", ["--out", str(tmp_path / "a"), "--times", "100"]) == 1
-    shown = capsys.readouterr()
-    assert shown.err == "scape work: --times: expected a count, got 100\n" and not shown.out
-    assert not list(tmp_path.iterdir())
-
-
-def test_some_failed(tmp_path, capsys):
-    assert command_line.run(work, "scape work", ["--out", str(tmp_path / "a.txt"), "--times", "7"]) == 1
-    assert "failed: scan7: empty" in capsys.readouterr().err
-
-
-def test_wrong_usage(tmp_path):
-    assert command_line.run(work, "scape work", ["--no-such"]) == 2
-    assert command_line.dispatch({"work": ("Do it.", "nowhere:work")}, "scape", ["nothing"], "lead") == 2
-    assert command_line.dispatch({"work": ("Do it.", "nowhere:work")}, "scape", [], "lead") == 2
-
-
-def test_help_imports_nothing(capsys):
-    assert command_line.dispatch({"work": ("Do it.", "nowhere:work")}, "scape", ["--help"], "lead") == 0
-    assert "Do it." in capsys.readouterr().out
-
-
 def test_ctrl_c_before_anything_is_loaded_is_one_line(tmp_path):
     """The first library that is imported interrupts; one that did not stop at once would be seen after a minute."""
     (tmp_path / "lazy_loader.py").write_text("import os, signal, time\nos.kill(os.getpid(), signal.SIGINT)\n"
@@ -74,21 +50,6 @@ def test_ctrl_c_before_anything_is_loaded_is_one_line(tmp_path):
                          env={**os.environ, "PYTHONPATH": os.pathsep.join([str(tmp_path), *sys.path])},
                          preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler))
     assert (run.returncode, run.stdout, run.stderr) == (130, "", "scape: interrupted; nothing was written\n")
-
-
-def notes(out: Path) -> Outcome:
-    """Say something about a file, twice."""
-    for _ in range(2):
-        warnings.warn(f"{out.name}: it has no colours", stacklevel=2)
-    out.write_text("done")
-    return Outcome(out, [], judgement=Judgement())
-
-
-def test_a_note_comes_once_and_is_in_the_report(tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr(command_line, "OUR_MODULES", r".*")
-    assert command_line.run(notes, "scape work", ["--out", str(tmp_path / "a.txt")]) == 0
-    assert capsys.readouterr().err.count("scape work: note: a.txt: it has no colours\n") == 1
-    assert json.loads((tmp_path / "a.txt.report.json").read_text())["notes"] == ["a.txt: it has no colours"]
 
 
 def test_a_log_file_gets_a_line_of_progress_now_and_then(capsys, monkeypatch):

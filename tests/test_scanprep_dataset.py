@@ -74,19 +74,6 @@ def test_names_that_people_give_their_scans(full, name):
     assert set(read_registered(full.folder).names) == set(back.names)
 
 
-def test_work_goes_on_after_an_interruption(full, monkeypatch):
-    def fail(path, mesh):
-        raise KeyboardInterrupt
-
-    with monkeypatch.context() as patch:
-        patch.setattr("scanprep.dataset._write_rows", fail)
-        with pytest.raises(KeyboardInterrupt):
-            full.add("dan1", body(7), "Dan")
-    back = RegisteredSet.create(full.folder, TEMPLATE)               # the mesh is there, the row is not
-    assert back.names == full.names and back.skeleton is not None
-    assert back.add("dan1", body(7), "Dan").names[-1] == "dan1"
-
-
 def test_two_who_add_by_turns_keep_each_others_rows(full):
     other = RegisteredSet.load(full.folder)
     full.add("x", body(1), "X")

@@ -13,7 +13,6 @@ from scanprep.geometry.budget import reading, spend
 from scanprep.geometry.files import MeshFileError, list_files, read_mesh, read_points
 from scanprep.geometry.format_common import load_bytes, polygons
 
-MANY = {"EXT_mesh_gpu_instancing": {"attributes": {"TRANSLATION": 1}}}
 VIEW = {"bufferView": 0, "componentType": 5126, "type": "VEC3"}
 SKINNED = [{"primitives": [{"attributes": {"POSITION": 0, "JOINTS_0": 1, "WEIGHTS_0": 2}}]}]
 WEIGHTED = CORNERS + np.ones(12, "<f4").tobytes()
@@ -22,10 +21,6 @@ ARRAYS = [{**VIEW, "count": 3}, {"componentType": 5121, "type": "VEC4", "count":
 
 
 @pytest.mark.parametrize(("name", "content", "words"), [
-    # one list of instances that a thousand nodes share, of a mesh without triangles
-    ("instances.glb", lambda: scene([{"mesh": 0, "extensions": MANY}] * 1000, roots=list(range(1000)),
-                                    meshes=[{"primitives": []}], accessors=[{**VIEW, "count": 3}, zeros(80_000)]),
-     "show their parts more than"),
     ("internal.glb", lambda: glb({"buffers": [{}] * 50_000, "nodes": []}, bytes(10**5)), "more than .* MB of arrays"),
     ("weights.glb", lambda: scene([{"mesh": 0, "skin": 0}] + [{}] * 60_000, 3, WEIGHTED, list(range(60_001)),
                                   skins=[{"joints": list(range(1, 60_001))}], accessors=[

@@ -7,9 +7,7 @@ import igl
 import numpy as np
 import pytest
 import trimesh
-from hypothesis import HealthCheck, given, settings
-from hypothesis import strategies as st
-from mesh_files import PLY_HEADER, PLY_ROWS, TETRAHEDRON, body, quiet, refused
+from mesh_files import PLY_HEADER, PLY_ROWS, TETRAHEDRON, body, refused
 
 from scanprep.geometry.files import UNITS, list_meshes, name_of, read_mesh, read_registered, write_mesh
 from scanprep.geometry.format_glb import tallest, turn_up
@@ -17,16 +15,6 @@ from scanprep.geometry.mesh import Mesh
 from scanprep.synthetic.people import BodyShape, SyntheticPerson
 
 EXACT = {".ply": 0, ".ply.gz": 0, ".obj": 1e-11, ".off": 1e-11, ".glb": 1e-6}
-
-
-@st.composite
-def meshes(draw):
-    n = draw(st.integers(3, 12))
-    number = st.floats(-4, 4, width=32)
-    vertices = draw(st.lists(st.tuples(number, number, number), min_size=n, max_size=n, unique=True))
-    faces = draw(st.lists(st.lists(st.integers(0, n - 1), min_size=3, max_size=3, unique=True), min_size=1,
-                          max_size=8))
-    return Mesh(np.array(vertices), np.array(faces))
 
 
 # ---- names
@@ -53,17 +41,6 @@ def test_round_trip_keeps_order_and_coordinates(tmp_path, suffix, precision):
     assert [p.name for p in tmp_path.iterdir()] == [f"a{suffix}"]
     write_mesh(tmp_path / f"b{suffix}", mesh, precision)
     assert (tmp_path / f"a{suffix}").read_bytes() == (tmp_path / f"b{suffix}").read_bytes()
-
-
-@pytest.mark.parametrize("suffix", EXACT)
-@settings(max_examples=25, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
-@given(mesh=meshes())
-def test_round_trip_of_any_mesh(tmp_path, suffix, mesh):
-    write_mesh(tmp_path / f"a{suffix}", mesh)
-    back = quiet(read_mesh, tmp_path / f"a{suffix}")
-    np.testing.assert_array_equal(back.faces, mesh.faces)
-    np.testing.assert_allclose(back.vertices, mesh.vertices, atol=1e-10)
-    assert back.colors is None
 
 
 def test_stl_gives_back_the_triangles_welded_in_order_of_use(tmp_path):
@@ -203,11 +180,6 @@ def test_units_become_metres(tmp_path, unit, factor, suffix):
     np.testing.assert_allclose(mesh.corners, TETRAHEDRON.corners, atol=1e-6)
 
 
-def test_a_number_is_the_length_of_a_unit(tmp_path):
-    write_mesh(tmp_path / "feet.ply", TETRAHEDRON.with_vertices(TETRAHEDRON.vertices / 0.3048))
-    np.testing.assert_allclose(read_mesh(tmp_path / "feet.ply", unit="0.3048").corners, TETRAHEDRON.corners, atol=1e-6)
-
-
 @pytest.mark.parametrize(("unit", "stature"), [*itertools.product(["mm", "cm", "in"], [1.4, 1.75, 2.2]), ("mm", 0.45),
                                                ("cm", 0.95)])
 @pytest.mark.parametrize("far", [0, 4e6])
@@ -269,7 +241,8 @@ def test_a_folder_of_one_topology_is_read_sorted_by_name(tmp_path):
     (Mesh(np.r_[TETRAHEDRON.vertices, [[1, 1, 1.0]]], TETRAHEDRON.faces),
      ["4 vertices and 4 faces", "5 vertices and 4 faces"]),
     (Mesh(TETRAHEDRON.vertices, TETRAHEDRON.faces[[0, 1, 3, 2]]),
-     ["from face 2", "[1, 2, 3]", "[0, 3, 2]", "flipped"])])
+     ["from face 2", "[1, 2, 3]", "[0, 3, 2]", "flipped"]),
+    (Mesh(TETRAHEDRON.vertices, TETRAHEDRON.faces[:, [0, 2, 1]]), ["inside out"])])
 def test_a_folder_of_two_topologies_names_the_file_and_the_difference(tmp_path, other, words):
     write_mesh(tmp_path / "a.ply", TETRAHEDRON)
     write_mesh(tmp_path / "b.ply", other)

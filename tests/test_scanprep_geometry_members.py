@@ -8,7 +8,7 @@ from model import LearnConfig, learn_blendscape, learn_scape, learn_skinning
 from model.learning.mixing import learn_scape_mix
 from scanprep import RegisteredSet, find_skeleton, write_mesh
 from scanprep.geometry import rotations
-from scanprep.geometry.files import MeshFileError, read_registered
+from scanprep.geometry.files import read_registered
 from scanprep.geometry.members import ONE_BODY, ONE_KIND, check_members, find_doubtful_members
 from scanprep.geometry.mesh import Mesh
 
@@ -139,10 +139,3 @@ def test_commands_name_the_file(truth, poses, tmp_path, capsys, command):
         assert f"{name}: bend3: it is a mirror image of the other bodies" in capsys.readouterr().err
     assert main(["learn", "--poses", str(tmp_path / "set"), "--shapes", str(tmp_path / "plain"), "--kind", "skinning",
                  "-o", str(tmp_path / "out.npz")]) == 1
-
-
-def test_a_file_that_is_inside_out_is_named(truth, tmp_path):
-    write_mesh(tmp_path / "a.ply", truth.template)
-    write_mesh(tmp_path / "b.ply", Mesh(truth.template.vertices, truth.template.faces[:, [0, 2, 1]]))
-    with pytest.raises(MeshFileError, match=r"b\.ply: it is inside out"):
-        read_registered(tmp_path)

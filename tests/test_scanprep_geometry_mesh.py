@@ -31,11 +31,6 @@ def pierced(seed=0):
     return mesh.submesh(~gone)[0]
 
 
-def rotation(seed=0):
-    q = np.linalg.qr(RNG(seed).normal(size=(3, 3)))[0]
-    return q * np.linalg.det(q)
-
-
 MESHES = {"ball": ball(), "grid": grid(), "pierced": pierced()}
 every = pytest.mark.parametrize("mesh", MESHES.values(), ids=MESHES)
 
@@ -64,17 +59,6 @@ def test_normals_and_areas_agree_with_igl(mesh):
     theirs = np.asarray(igl.per_vertex_normals(v, f, igl.PER_VERTEX_NORMALS_WEIGHTING_TYPE_AREA))
     np.testing.assert_allclose(mesh.vertex_normals, theirs, atol=1e-9)
     assert mesh.vertex_areas.sum() == pytest.approx(mesh.face_areas.sum())
-
-
-@every
-def test_quantities_follow_a_rigid_motion_and_a_scale(mesh):
-    R, scale = rotation(1), 2.5
-    moved = mesh.with_vertices(scale * mesh.vertices @ R.T + (1, 2, 3))
-    np.testing.assert_allclose(moved.face_areas, scale**2 * mesh.face_areas)
-    np.testing.assert_allclose(moved.vertex_normals, mesh.vertex_normals @ R.T, atol=1e-12)
-    np.testing.assert_allclose(moved.edge_lengths, scale * mesh.edge_lengths)
-    if mesh.is_closed:
-        assert moved.volume == pytest.approx(scale**3 * mesh.volume)
 
 
 def test_volume_of_known_solids_and_its_sign():

@@ -1,12 +1,11 @@
 """Files of points: what is written comes back, and other forms are understood."""
 
-import warnings
 
 import numpy as np
 import pytest
 from mesh_files import TETRAHEDRON
 
-from scanprep.geometry.files import MeshFileError, PointCloud, read_mesh, read_points, write_mesh, write_points
+from scanprep.geometry.files import PointCloud, read_mesh, read_points, write_mesh, write_points
 
 
 def cloud(rng, normals=True, colors=True):
@@ -45,13 +44,6 @@ def test_pcd_ascii_leaves_out_points_without_return_and_unpacks_colours(tmp_path
     np.testing.assert_array_equal(points.colors, [[1, 0, 0], [0, 0, 1]])
 
 
-def test_points_have_units_too(tmp_path):
-    write_points(tmp_path / "a.xyz", PointCloud(np.array([[0, 0, 0], [0, 0, 1800.0]])))
-    with pytest.warns(UserWarning, match=r"a\.xyz.*unit='mm'"):
-        np.testing.assert_allclose(read_points(tmp_path / "a.xyz").points, [[0, 0, 0], [0, 0, 1.8]])
-    np.testing.assert_allclose(read_points(tmp_path / "a.xyz", unit="mm").points, [[0, 0, 0], [0, 0, 1.8]])
-
-
 def test_what_a_depth_camera_writes_where_it_saw_nothing_is_no_size(tmp_path):
     # A bust in metres, and 3% of the pixels at 65.535 m, which alone would be 1.66 m in inches.
     rng = np.random.default_rng(0)
@@ -63,11 +55,3 @@ def test_what_a_depth_camera_writes_where_it_saw_nothing_is_no_size(tmp_path):
     write_points(tmp_path / "mm.ply", PointCloud(3000 * bust, None, None))
     with pytest.warns(UserWarning, match="mm"):
         read_points(tmp_path / "mm.ply")
-
-
-def test_a_table_of_empty_cells_holds_no_points(tmp_path):
-    (tmp_path / "excel.txt").write_text(";\n")
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        with pytest.raises(MeshFileError, match=r"excel\.txt"):
-            read_points(tmp_path / "excel.txt")

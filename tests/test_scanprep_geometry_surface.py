@@ -52,18 +52,6 @@ def test_barycentric_coordinates_come_back_and_flat_triangles_give_their_first_c
     np.testing.assert_array_equal(barycentric(np.ones((1, 3)), np.ones((1, 3, 3))), [[1, 0, 0]])
 
 
-def test_matches_mind_the_normal_on_a_thin_sheet():
-    points = RNG(6).uniform(0, 1, (300, 2))
-    front, back = np.c_[points, np.full(300, 0.01)], np.c_[points, np.full(300, 0.0)]
-    normals = np.r_[np.tile([0, 0, 1.0], (300, 1)), np.tile([0, 0, -1.0], (300, 1))]
-    target = OrientedPoints(np.r_[front, back], normals)
-    query = front - (0, 0, 0.009)                    # nearer to the back, but it faces the front
-    found = target.match(query, normals[:300])
-    np.testing.assert_array_equal(found.index, np.arange(300))
-    np.testing.assert_allclose(found.distances, 0.009)
-    assert found.valid.all()
-
-
 def test_matches_are_the_best_in_six_dimensions_within_the_limits():
     rng, scale = RNG(7), 0.05
     unit = lambda n: n / np.linalg.norm(n, axis=1, keepdims=True)            # noqa: E731

@@ -1,10 +1,7 @@
 """A folder of scans: resumable, and one bad scan stops no other."""
 import dataclasses
 import json
-import os
 import shutil
-import subprocess
-import sys
 
 import numpy as np
 import pytest
@@ -12,7 +9,6 @@ from scan_folders import MARKS, QUICK, ball, contents, write_scans
 from scipy.spatial.transform import Rotation
 
 from scanprep import Mesh, RegisteredSet, read_mesh, write_landmarks, write_mesh
-from scanprep.batch.ownership import HOME, ForeignFileError
 from scanprep.batch.pool import Workers
 from scanprep.cleaning.clean_scan import CleanScanConfig
 from scanprep.correspondence.correspondences import Correspondences
@@ -97,17 +93,6 @@ def test_registers_all(scans, template, tmp_path):
     assert json.loads((tmp_path / "set" / "landmarks.json").read_text()) == MARKS
 
 
-def test_goes_on_and_does_nothing_twice(scans, template, tmp_path):
-    tasks = find_scans(scans)
-    prepare(tasks[1:], template, MARKS, tmp_path / "set", QUICK)
-    written = {p: p.stat().st_mtime_ns for p in (tmp_path / "set" / "meshes").iterdir()}
-    done = prepare(tasks, template, MARKS, tmp_path / "set", QUICK)
-    assert len(done.figures) == 3 and done.fresh == 1
-    assert done.registered.names == ("body0", "body1", "body2")
-    assert all(p.stat().st_mtime_ns == t for p, t in written.items())
-    assert not [p for p in (tmp_path / "set").rglob("*") if ".part" in p.name]
-
-
 def test_only_what_has_changed_is_done_again(scans, template, tmp_path):
     prepare(find_scans(scans), template, MARKS, tmp_path / "set", QUICK)
     before = contents(tmp_path / "set")
@@ -119,20 +104,6 @@ def test_only_what_has_changed_is_done_again(scans, template, tmp_path):
     changed = {name for name, data in contents(tmp_path / "set").items() if data != before[name]}
     assert changed == {"meshes/body1.ply", "pictures/body1.webp", "pictures/body1.scene", "registration.csv",
                        "report.html"}
-
-
-def test_two_runs_in_one_folder(scans, template, tmp_path):
-    prepare(find_scans(scans)[:1], template, MARKS, tmp_path / "set", QUICK)
-    before = contents(tmp_path / "set")
-    code = ("import sys\nfrom scanprep.batch.opening import workspace\nwith workspace(sys.argv[1]):\n"
-            "    print('in', flush=True)\n    sys.stdin.read()\n")
-    other = subprocess.Popen([sys.executable, "-c", code, str(tmp_path / "set")], stdin=subprocess.PIPE,
-                             stdout=subprocess.PIPE)
-    assert other.stdout.readline() == b"in\n"
-    with pytest.raises(ValueError, match=f"another run is at work .*process {other.pid} "):
-        prepare(find_scans(scans), template, MARKS, tmp_path / "set", QUICK)
-    other.communicate()
-    assert contents(tmp_path / "set") == before and not (tmp_path / "set" / HOME / "lock").exists()
 
 
 def test_bad_scans_stop_no_other(scans, template, tmp_path):
@@ -223,26 +194,6 @@ def test_a_table_that_was_corrected_registers_nothing_anew(scans, template, tmp_
     (scans / "scans.csv").write_text("name,subject,sex\nbody0,zoe,female\n")
     done = prepare(find_scans(scans), template, MARKS, tmp_path / "set", QUICK)
     assert done.fresh == 0 and done.registered.entries[0].subject == "zoe"
-
-
-@pytest.mark.slow
-def test_what_the_user_put_there_is_left_alone(scans, template, tmp_path):
-    whole = contents(scans)
-    with pytest.raises(ForeignFileError, match="nothing was touched"):
-        prepare(find_scans(scans), template, MARKS, scans, QUICK)
-    assert contents(scans) == whole and not (scans / HOME).exists()
-    prepare(find_scans(scans), template, MARKS, tmp_path / "set", QUICK)
-    mesh, note = tmp_path / "set" / "meshes" / "body1.ply", tmp_path / "set" / "meshes" / ".mine.part.txt"
-    mesh.write_bytes(b"mended by hand")
-    note.write_text("mine")
-    os.utime(scans / "body1.ply")
-    assert prepare(find_scans(scans), template, MARKS, tmp_path / "set", QUICK).fresh == 0
-    marks = json.loads((scans / "body1.landmarks.json").read_text())
-    marks["top"][2] += 0.05
-    (scans / "body1.landmarks.json").write_text(json.dumps(marks))
-    done = prepare(find_scans(scans), template, MARKS, tmp_path / "set", QUICK)
-    assert "body1.ply: in the way" in done.failures[0]
-    assert mesh.read_bytes() == b"mended by hand" and note.read_text() == "mine"
 
 
 @pytest.mark.slow

@@ -33,7 +33,7 @@ OWN_MESH = "own.glb"
 # Apart: a larger part whose median distance from the body is more (a staff, a shield) keeps its shape too.
 WELDED, STIFF, APART = 1e-5, 0.2, 0.03
 SAMPLES = 50_000     # points over the whole surface that tell how far its parts are from the body: 1 cm on a person
-DROPPED = ("KHR_draco_mesh_compression", "EXT_mesh_gpu_instancing")      # extensions whose arrays are written out plain
+DROPPED = ("KHR_draco_mesh_compression",)      # extensions whose arrays are written out plain
 
 
 class PlacedPrimitive(NamedTuple):
@@ -235,17 +235,16 @@ def place_pieces(tree: dict[str, Any], binary: bytes, frame: np.ndarray) -> Shap
         joints = (glb.joint_matrices(tree, binary, glb.item(tree["skins"], node["skin"]), places)
                   if "skin" in node else None)
         pieces = []
-        for instance in glb.instances_of(tree, binary, node, matrix):
-            for primitive in glb.item(tree["meshes"], node["mesh"])["primitives"]:
-                if primitive.get("mode", 4) not in (4, 5, 6):             # triangles, strips, fans
-                    continue
-                spend(visits=1)
-                motion = instance[None]
-                if joints is not None and "JOINTS_0" in primitive["attributes"]:
-                    weights = glb.weights_of(tree, binary, primitive, len(joints))
-                    spend(memory=128 * len(weights))
-                    motion = np.einsum("nj,jab->nab", weights, joints)
-                pieces.append(PlacedPrimitive(primitive, tree, binary, motion))
+        for primitive in glb.item(tree["meshes"], node["mesh"])["primitives"]:
+            if primitive.get("mode", 4) not in (4, 5, 6):             # triangles, strips, fans
+                continue
+            spend(visits=1)
+            motion = matrix[None]
+            if joints is not None and "JOINTS_0" in primitive["attributes"]:
+                weights = glb.weights_of(tree, binary, primitive, len(joints))
+                spend(memory=128 * len(weights))
+                motion = np.einsum("nj,jab->nab", weights, joints)
+            pieces.append(PlacedPrimitive(primitive, tree, binary, motion))
         out += [(node, pieces)] if pieces else []
     return out
 

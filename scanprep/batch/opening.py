@@ -96,7 +96,7 @@ def _lock_and_recover(space: Workspace) -> Iterator[Workspace]:
 
 
 @contextlib.contextmanager
-def lock_output(path: Path, output: Path, wait: bool = False) -> Iterator[None]:
+def lock_output(path: Path, output: Path) -> Iterator[None]:
     """Keep other runs out of an output until the block ends.
 
     The operating system holds the lock, so a killed run leaves none behind. `output` is for the message.
@@ -104,17 +104,13 @@ def lock_output(path: Path, output: Path, wait: bool = False) -> Iterator[None]:
     Raises
     ------
     ValueError
-        Another run holds the lock, unless `wait`.
+        Another run holds the lock.
     """
     while True:
         # never through a link, which would write elsewhere
         flags = os.O_RDWR | os.O_CREAT | os.O_APPEND | getattr(os, "O_NOFOLLOW", 0)
         with open(os.open(path, flags, 0o666), "a+", encoding="utf-8") as file:
             if not _take(file):
-                if wait:
-                    # seconds between two attempts: short for the user, no load for the machine
-                    time.sleep(0.2)
-                    continue
                 file.seek(0)
                 raise ValueError(f"{output}: another run is at work on this output ({file.read().strip()}); "
                                  "wait for it, or name another output")

@@ -31,21 +31,17 @@ def report_path(output: Path) -> Path:
 def digests_in_report(output: Path) -> dict[str, str]:
     """Return file -> digest of everything a command wrote for an output, as its report says; empty without report.
 
-    Paths start at the folder of the report. Older reports were named without the file ending; they count too.
+    Paths start at the folder of the report.
     """
-    older_names = [] if output.is_dir() else [output.with_suffix(".report.json")]
-    for report in (report_path(output), *older_names):
-        try:
-            with storage.taking_apart(report, "a report"):
-                written = storage.read_json(report, "a report")["written"]
-        except storage.StorageError:
-            continue
-        # an older report name may belong to another output: it must list this file
-        if isinstance(written, dict) and (report not in older_names or output.name in written):
-            for file in written:
-                storage.path_inside(report.parent, file, report)
-            return {**written, report.name: Digests().of_file(report)}
-    return {}
+    report = report_path(output)
+    try:
+        with storage.taking_apart(report, "a report"):
+            written = dict(storage.read_json(report, "a report")["written"])
+    except storage.StorageError:
+        return {}
+    for file in written:
+        storage.path_inside(report.parent, file, report)
+    return {**written, report.name: Digests().of_file(report)}
 
 
 def refuse_any(folder: Path) -> None:

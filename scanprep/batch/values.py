@@ -94,9 +94,4 @@ def _unpack(packed: Any, arrays: list[np.ndarray]) -> Any:
         raise ValueError(f"{name} is not a dataclass that is kept")
     if values.keys() != {f.name for f in dataclasses.fields(kind)}:
         raise ValueError(f"{name}: expected the values {', '.join(f.name for f in dataclasses.fields(kind))}")
-    # fields that the constructor does not take are set afterwards
-    instance = kind(**{f.name: values[f.name] for f in dataclasses.fields(kind) if f.init})
-    for f in dataclasses.fields(kind):
-        if not f.init:
-            object.__setattr__(instance, f.name, values[f.name])
-    return instance
+    return kind(**values)

@@ -15,9 +15,8 @@ import contextlib
 import os
 import shutil
 import tempfile
-import time
 from collections.abc import Callable, Collection, Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Any, TypeVar
@@ -368,29 +367,15 @@ def _files_of(record: Path, folder: Path) -> dict[str, str]:
     return dict((_read_record(record, folder) or {"files": {}})["files"])
 
 
-
 @dataclass(frozen=True, eq=False)
 class KeptSteps:
     """Steps kept in an output; a finished step removes the steps inside it."""
 
     space: Workspace
-    found: list[str] = field(default_factory=list)          # steps that were done before this run
-    seconds: dict[str, float] = field(default_factory=dict)     # duration of the steps that were run now
 
     def __call__(self, name: str, inputs: Any, make: Callable[[], T]) -> T:
-        """Return the kept result of a step, or run it and note how long it took."""
-        begun, made = time.perf_counter(), False
-
-        def now(folder: Path) -> T:
-            nonlocal made
-            made = True
-            return make()
-
-        value = self.space.step(name, inputs, now)
-        if made:
-            self.seconds[name] = time.perf_counter() - begun
-        elif name not in self.seconds:
-            self.found.append(name)
+        """Return the kept result of a step, or run it."""
+        value = self.space.step(name, inputs, lambda folder: make())
         # its inner steps are not needed any more
         self.space.drop_others(f"{name}/")
         return value

@@ -16,7 +16,7 @@ from pathlib import Path
 # Bytes of arrays for every byte of a file: text makes up to 60, and packed text as many. Our own arrays of zeros pack
 # a thousand times, so the first 128 MB are free.
 FREE, PER_BYTE = 2**27, 100
-# Nodes, instances, primitives, and rows that are read one by one: each is a byte or more, but instances share theirs.
+# Nodes, primitives, and rows that are read one by one: each is a byte or more.
 VISITS = 100_000
 # Seconds of the processor, and as many for each MB: a file of small polygons takes 1 s for a MB, on a fast machine.
 SECONDS, PER_MB = 6.0, 4.0
@@ -91,7 +91,7 @@ def spend(memory: int = 0, visits: int = 0) -> None:
     memory : int
         Bytes of the arrays that are made next.
     visits : int
-        Nodes, instances or primitives that are looked at next.
+        Nodes or primitives that are looked at next.
 
     Raises
     ------

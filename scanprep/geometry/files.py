@@ -106,8 +106,8 @@ def read_mesh(path: str | Path, unit: str | None = None) -> Mesh:
     path : str or Path
         PLY, OBJ, STL, OFF, GLB or glTF, also packed as `.ply.gz`.
     unit : 'm', 'mm', 'cm' or 'in', optional
-        Unit of the file. By default the unit that the file names. Else the unit in which the mesh is as large as a
-        person, with a UserWarning. Else metres, with a UserWarning above 10 m or below 0.1 m.
+        Unit of the file. By default the unit in which the mesh is as large as a person, with a UserWarning. Else
+        metres, with a UserWarning above 10 m or below 0.1 m.
 
     Returns
     -------
@@ -152,7 +152,7 @@ def _mesh(path: Path, contents: Contents, unit: str | None) -> Mesh:
         listed = ", ".join(f"{name} ({number_of(count, 'triangle')})" for name, count in contents.objects[:6])
         more = ", ..." if len(contents.objects) > 6 else ""
         warnings.warn(f"{path}: {len(contents.objects)} objects were taken for one mesh: {listed}{more}", stacklevel=2)
-    scale = metres_per_unit(path, mesh.vertices, unit, named=contents.metres)
+    scale = metres_per_unit(path, mesh.vertices, unit)
     return mesh if scale == 1 else mesh.with_vertices(scale * mesh.vertices, mesh.up)
 
 
@@ -245,7 +245,7 @@ def read_points(path: str | Path, unit: str | None = None) -> PointCloud:
 
 def _cloud(path: Path, contents: Contents, unit: str | None) -> PointCloud:
     """Make the points of a file in metres, with normals from the file or its triangles."""
-    points = metres_per_unit(path, contents.vertices, unit, named=contents.metres) * contents.vertices
+    points = metres_per_unit(path, contents.vertices, unit) * contents.vertices
     normals = contents.normals
     if normals is not None:
         normals = np.where(np.isfinite(normals).all(axis=1, keepdims=True), normals, 0.0)
@@ -381,7 +381,7 @@ def _read(path: Path) -> Contents:
     if not len(contents.vertices):
         raise EmptyFileError(f"{path}: the file holds no vertices")
     contents = _finite(path, contents)
-    check_extent(path, "vertex", contents.vertices)
+    check_extent(path, contents.vertices)
     return contents
 
 

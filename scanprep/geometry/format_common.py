@@ -40,7 +40,6 @@ class Contents:
     colors: np.ndarray | None = None        # (N, 3) in [0, 1]
     objects: tuple[tuple[str, int], ...] = ()       # name and triangles of each, where the format has objects
     of_file: np.ndarray | None = None       # (M,) number of each vertex of the file here, -1 if left out
-    metres: float = 1.0                     # length of the file's unit, if it names one
     up: int | None = None                   # axis that points up, if the format says it
 
 
@@ -78,11 +77,11 @@ def as_utf8(data: bytes) -> bytes:
     return data.removeprefix(b"\xef\xbb\xbf")
 
 
-def check_extent(path: Path, what: str, points: np.ndarray) -> None:
+def check_extent(path: Path, points: np.ndarray) -> None:
     """Raise MeshFileError for coordinates that are too large for lengths and areas to be computed."""
     far = np.flatnonzero((np.abs(points) > FARTHEST).any(axis=1) & np.isfinite(points).all(axis=1))
     if len(far):
-        raise MeshFileError(f"{path}: {what} {far[0]} lies at {points[far[0]].tolist()}, "
+        raise MeshFileError(f"{path}: vertex {far[0]} lies at {points[far[0]].tolist()}, "
                             f"expected coordinates below {FARTHEST:g}")
 
 
@@ -123,19 +122,15 @@ def guess_unit(extent: float) -> str | None:
     return next((unit for unit, (least, most) in PERSON.items() if least <= extent * UNITS[unit] <= most), None)
 
 
-def metres_per_unit(path: Path, points: np.ndarray, unit: str | None, smallest: float = 0.1, named: float = 1.0
-                    ) -> float:
+def metres_per_unit(path: Path, points: np.ndarray, unit: str | None, smallest: float = 0.1) -> float:
     """Find the factor from the unit of a file to metres.
 
-    By default it is the unit that the file names, `named` metres, with a warning. If that is metres, but the points
-    span as much as a person in another unit, it is that unit. Else it is metres, with a warning if the points span more
-    than 10 m or less than `smallest`. Only the extent of the points counts, not their position.
+    By default it is metres, but if the points span as much as a person in another unit, it is that unit. There is a
+    warning if they span more than 10 m or less than `smallest`. Only the extent of the points counts, not their
+    position.
     """
     if unit is not None:
         return metres_of(unit)
-    if named != 1:
-        warnings.warn(f"{path}: the file says that its unit is {named:g} m", stacklevel=3)
-        return named
     extent = float(np.ptp(points, axis=0).max()) if len(points) else 0.0
     if extent > 10:                          # many depth cameras write 65.535 m for missing points
         inner = float(np.ptp(np.quantile(points, [0.05, 0.95], axis=0), axis=0).max())

@@ -31,7 +31,7 @@ GENERATOR = "scapekit"
 
 _DRACO, _INSTANCES = "KHR_draco_mesh_compression", "EXT_mesh_gpu_instancing"
 # required extensions that are supported, and prefixes of those that do not change triangles
-_KNOWN = (_INSTANCES, "KHR_mesh_quantization")
+_KNOWN = ("KHR_mesh_quantization",)
 _HARMLESS = ("KHR_materials_", "KHR_texture_", "EXT_texture_", "MSFT_texture_", "KHR_lights_", "EXT_lights_",
              "KHR_animation_", "KHR_xmp", "KHR_technique")
 
@@ -69,6 +69,7 @@ def read_tree(path: Path, data: bytes) -> tuple[dict[str, Any], bytes]:
 def _check_extensions(path: Path, tree: dict[str, Any]) -> None:
     """Raise MeshFileError where the triangles need an extension that is not read here."""
     needed = {str(name) for name in tree.get("extensionsRequired", [])}
+    needed |= {_INSTANCES} & {str(name) for name in tree.get("extensionsUsed", [])}       # or a part would be missing
     for mesh in tree.get("meshes", []):
         for primitive in mesh["primitives"]:
             packed = _DRACO in primitive.get("extensions", {})
@@ -130,51 +131,37 @@ def _scene(path: Path, tree: dict[str, Any], binary: bytes) -> Contents:
             continue
         name = node.get("name") or item(tree["meshes"], node["mesh"]).get("name") or f"node {number}"
         joints = joint_matrices(tree, binary, item(tree["skins"], node["skin"]), places) if "skin" in node else None
-        # every instance of the node's mesh, every primitive; skinned vertices by their joints, others by the matrix
-        for instance in instances_of(tree, binary, node, matrix):
-            before = len(faces)
-            placed: dict[tuple[int, Any], int] = {}                # primitives may share their vertices
-            for primitive in tree["meshes"][node["mesh"]]["primitives"]:
-                spend(visits=1)
-                if primitive.get("mode", 4) not in shown:
-                    continue
-                points = primitive["attributes"]["POSITION"], primitive["attributes"].get("JOINTS_0")
-                local = accessor(tree, binary, points[0], "VEC3").astype(np.float64)
-                if points not in placed:
-                    placed[points] = start
-                    if joints is not None and points[1] is not None:
-                        vertices.append(apply_skin(local, weights_of(tree, binary, primitive, len(joints)), joints))
-                    else:
-                        vertices.append(local @ instance[:3, :3].T + instance[:3, 3])
-                    colors.append(_colors(tree, binary, primitive, len(local)))
-                    start += len(local)
-                corners = np.zeros((0, 3), int)
-                if 0 not in shown:
-                    corners = primitive_triangles(tree, binary, primitive, len(local))
-                # a mirroring matrix inverts triangles
-                if np.linalg.det((instance if joints is None else joints[0])[:3, :3]) < 0:
-                    corners = corners[:, ::-1]
-                faces.append(polygons(path, np.full(len(corners), 3), corners.ravel(), len(local)) + placed[points])
-            if len(faces) > before:
-                objects.append((str(name), sum(map(len, faces[before:]))))
+        # every primitive of the node's mesh; skinned vertices by their joints, others by the matrix
+        before = len(faces)
+        placed: dict[tuple[int, Any], int] = {}                # primitives may share their vertices
+        for primitive in tree["meshes"][node["mesh"]]["primitives"]:
+            spend(visits=1)
+            if primitive.get("mode", 4) not in shown:
+                continue
+            points = primitive["attributes"]["POSITION"], primitive["attributes"].get("JOINTS_0")
+            local = accessor(tree, binary, points[0], "VEC3").astype(np.float64)
+            if points not in placed:
+                placed[points] = start
+                if joints is not None and points[1] is not None:
+                    vertices.append(apply_skin(local, weights_of(tree, binary, primitive, len(joints)), joints))
+                else:
+                    vertices.append(local @ matrix[:3, :3].T + matrix[:3, 3])
+                colors.append(_colors(tree, binary, primitive, len(local)))
+                start += len(local)
+            corners = np.zeros((0, 3), int)
+            if 0 not in shown:
+                corners = primitive_triangles(tree, binary, primitive, len(local))
+            # a mirroring matrix inverts triangles
+            if np.linalg.det((matrix if joints is None else joints[0])[:3, :3]) < 0:
+                corners = corners[:, ::-1]
+            faces.append(polygons(path, np.full(len(corners), 3), corners.ravel(), len(local)) + placed[points])
+        if len(faces) > before:
+            objects.append((str(name), sum(map(len, faces[before:]))))
     if not vertices:
         raise MeshFileError(f"{path}: expected a mesh, found a glTF file without triangles and points")
     shades = [c for c in colors if c is not None]
     return Contents(np.concatenate(vertices) @ turn_up(up_of(tree)), np.concatenate(faces), None,
                     np.concatenate(shades) if len(shades) == len(colors) else None, tuple(objects), up=up_of(tree))
-
-
-def instances_of(tree: dict[str, Any], binary: bytes, node: dict[str, Any], matrix: np.ndarray) -> list[np.ndarray]:
-    """Return the matrices (4, 4) of all instances of a node's mesh: one, or those of EXT_mesh_gpu_instancing."""
-    instancing = node.get("extensions", {}).get(_INSTANCES)
-    if instancing is None:
-        return [matrix]
-    rows = {key: accessor(tree, binary, instancing["attributes"][name], kind).astype(np.float64).tolist()
-            for key, name, kind in (("translation", "TRANSLATION", "VEC3"), ("rotation", "ROTATION", "VEC4"),
-                                    ("scale", "SCALE", "VEC3")) if name in instancing["attributes"]}
-    count = min(map(len, rows.values()), default=0)
-    spend(visits=count)
-    return [matrix @ _matrix({key: values[i] for key, values in rows.items()}) for i in range(count)]
 
 
 def joint_matrices(tree: dict[str, Any], binary: bytes, skin: dict[str, Any], places: dict[int, np.ndarray]

@@ -117,10 +117,6 @@ def _slicer(path: Path, markups: list[Any], unit: str | None) -> LandmarkFile:
     return LandmarkFile(pairs, own_unit, flipped=True)
 
 
-_FIDUCIALS = "id,x,y,z,ow,ox,oy,oz,vis,sel,lock,label,desc,associatedNodeID".split(",")
-_FIDUCIALS_OLD = "label,x,y,z,sel,vis".split(",")            # of 3D Slicer 3
-
-
 def _fiducials(path: Path, data: bytes) -> LandmarkFile:
     """Read the points of an .fcsv file of 3D Slicer, in LPS; a file that does not name its axes is RAS."""
     heading = [line.lstrip(b"# ").strip() for line in data.splitlines() if line.startswith(b"#")]
@@ -128,14 +124,15 @@ def _fiducials(path: Path, data: bytes) -> LandmarkFile:
     signs = {b"0": (-1, -1, 1), b"RAS": (-1, -1, 1), b"1": (1, 1, 1), b"LPS": (1, 1, 1)}.get(*stated or [b"RAS"])
     if signs is None:
         raise MeshFileError(f"{path}: expected CoordinateSystem = LPS or RAS (1 or 0), found {quote(stated[0])}")
-    named = [line.split(b"=")[-1].strip().decode().split(",") for line in heading if b",x,y,z," in line + b","]
+    columns = next((line.split(b"=")[-1].strip().decode().split(",") for line in heading if b",x,y,z," in line), None)
+    if columns is None:
+        raise MeshFileError(f"{path}: expected a line '# columns = id,x,y,z,...' of 3D Slicer, found none")
     pairs: _Points = []
     lines = Lines(path, b"\n".join(b"" if line.startswith(b"#") else line for line in data.splitlines()))
     for row in range(len(lines)):
         words = _cells(lines, row, ",")
-        columns = named[0] if named else _FIDUCIALS if len(words) > len(_FIDUCIALS_OLD) else _FIDUCIALS_OLD
         # 3D Slicer 5 adds a status column: 2 for a placed point
-        if len(words) > len(columns) == len(_FIDUCIALS) and words[len(columns)] != "2":
+        if len(words) > len(columns) and words[len(columns)] != "2":
             continue
         pairs.append(_point_of_row(lines, row, dict(zip(columns, words, strict=False)), "label", ",".join(columns)))
     return LandmarkFile([(name, point * signs) for name, point in pairs], "mm", flipped=True)

@@ -169,12 +169,10 @@ def _handedness(template: Mesh, bodies: np.ndarray) -> np.ndarray:
     Surfaces are smoothed first, as noise bends short edges at random.
     """
     # the tetrahedra: the two ends of every inner edge, and the corners opposite to it
-    sides = template.face_edges.ravel()
-    order = np.argsort(sides, kind="stable")
-    first = np.flatnonzero(sides[order][1:] == sides[order][:-1])
-    across = np.roll(template.faces, 1, axis=1).ravel()[order]          # the corner opposite to the sides 01, 12, 20
-    a, b = template.edges[sides[order][first]].T
-    c, d = across[first], across[first + 1]
+    first, second = template.side_pairs.T
+    across = np.roll(template.faces, 1, axis=1).ravel()                 # the corner opposite to the sides 01, 12, 20
+    a, b = template.edges[template.face_edges.ravel()[first]].T
+    c, d = across[first], across[second]
     neighbours = template.vertex_adjacency
     share = 1 / neighbours.sum(axis=1)[:, None]
 

@@ -119,7 +119,7 @@ def _texture_of(path: Path, unit: str | None) -> Texture | None:
     if problems:
         warnings.warn(f"{path}: some of its pictures cannot be read, what they show is grey ({problems})", stacklevel=2)
     mesh = Mesh(np.asarray(loaded.vertices, dtype=np.float64), np.asarray(loaded.faces))
-    check_extent(path, "vertex", mesh.vertices)
+    check_extent(path, mesh.vertices)
     with warnings.catch_warnings():          # the reader of the mesh warns about the unit already
         warnings.simplefilter("ignore", UserWarning)
         vertices = metres_per_unit(path, mesh.vertices, unit) * mesh.vertices

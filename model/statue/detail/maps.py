@@ -9,13 +9,12 @@ displacement.json      size, zero, scale and these four grey values
 """
 from __future__ import annotations
 
-import io
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from scanprep.geometry.images import check_pixels, open_image
+from scanprep.geometry.images import open_image
 from scanprep.geometry.storage import StorageError, read_bytes, read_json, taking_apart, write_json, writing
 from scanprep.pictures import png16
 
@@ -84,25 +83,17 @@ def _write_png(path: Path, image: np.ndarray) -> None:
 
 
 def _write_tiff(path: Path, image: np.ndarray) -> None:
-    import tifffile
+    from PIL import Image
 
     with writing(path) as beside:
-        tifffile.imwrite(beside, image.astype(np.float32), compression="zlib",
-                         photometric="minisblack", metadata=None)
+        Image.fromarray(image.astype(np.float32)).save(beside, format="TIFF", compression="tiff_adobe_deflate")
 
 
 def _read(path: Path, size: tuple[int, ...], kind: Any) -> np.ndarray:
     """Read a TIFF or PNG image of this shape and number type, else StorageError."""
-    if path.suffix == ".tif":
-        import tifffile
-
-        with (taking_apart(path, "a TIFF image of single-precision numbers"),
-              tifffile.TiffFile(io.BytesIO(read_bytes(path))) as file):
-            check_pixels(file.pages[0].shape[:2])
-            image = np.asarray(file.pages[0].asarray())
-    else:
-        with taking_apart(path, "a PNG image"):
-            image = _decode_image(path, "a PNG image")[0]
+    what = "a TIFF image of single-precision numbers" if path.suffix == ".tif" else "a PNG image"
+    with taking_apart(path, what):
+        image = _decode_image(path, what)[0]
     if image.shape != tuple(size) or image.dtype != kind or not np.isfinite(image).all():
         raise StorageError(f"{path}: expected {np.dtype(kind).name} numbers of shape {tuple(size)}, all finite, "
                            f"got {image.dtype} of shape {image.shape}")
