@@ -4,8 +4,9 @@ import pytest
 from people_bodies import kept, small_people
 
 from completion import LabelStream, MarkerStream
+from completion.mocap.labelling.assignment import certainty
 from completion.mocap.labelling.body_search import Placement
-from completion.mocap.labelling.live_matching import ALONE, SEEN_SD, Expected, certainty, intersect, match, shift_groups
+from completion.mocap.labelling.live_matching import SEEN_SD, Expected, intersect, match, shift_groups
 from completion.mocap.marker_sets.named import load_layout
 from model.human_poses import human_poses
 from scanprep.geometry import rotations
@@ -196,8 +197,8 @@ def test_matches_are_within_what_is_known_of_a_marker():
 
 def test_confidence_is_half_where_two_points_are_alike():
     cost = np.array([[1.0, 1.0, 20.0], [20.0, 20.0, 0.0]])
-    np.testing.assert_allclose(certainty(cost, np.array([0, 2])), [0.5, 1 / (1 + np.exp(-ALONE))])
-    np.testing.assert_allclose(certainty(cost, np.array([-1, 2]))[0], 0)
+    np.testing.assert_allclose(certainty(cost, np.array([0, 2]), 9.0), [0.5, 1 / (1 + np.exp(-9.0))])
+    assert certainty(cost, np.array([-1, 2]), 9.0)[0] == 0
 
 
 def test_markers_that_moved_on_together_keep_their_labels():
