@@ -3,7 +3,7 @@ import numpy as np
 import pytest
 from people_bodies import kept, small_people
 
-from completion import LabelStream, MarkerStream
+from completion import LabelStream
 from completion.mocap.labelling.assignment import certainty
 from completion.mocap.labelling.body_search import Placement
 from completion.mocap.labelling.live_matching import SEEN_SD, Expected, intersect, match, shift_groups
@@ -95,13 +95,6 @@ def test_the_order_of_points_does_not_matter_and_no_later_frame_is_looked_at(sub
         np.testing.assert_array_equal(names[i, frames[i].columns], frame.columns)
         np.testing.assert_allclose(frame.pose, frames[i].pose, atol=1e-6)
         np.testing.assert_allclose(frame.confidence, frames[i].confidence, atol=1e-6)
-
-
-def test_the_body_is_that_of_a_stream_with_names(subject, layout, motion, clean):
-    named = pushed(MarkerStream(subject, layout, layout.labels, RATE), motion[2])
-    bodies = [subject.vertices(np.array([f.pose for f in of]), np.array([f.trans for f in of]))
-              for of in (named, clean[0])]
-    assert np.linalg.norm(bodies[0][10:] - bodies[1][10:], axis=2).mean() < 0.003
 
 
 def test_missing_points_and_ghosts_do_little(subject, layout, motion):
