@@ -5,7 +5,6 @@ import numpy as np
 import pytest
 
 from completion import motion_pictures
-from model.statue import report
 from scanprep.pictures import scene, shading
 from scanprep.pipeline import page
 
@@ -32,6 +31,6 @@ def coarse(shapes, camera, width, height):
 def coarse_pictures():
     """Everything that draws bodies draws few pixels."""
     with pytest.MonkeyPatch.context() as patch:
-        for module in (scene, page, report, motion_pictures):
+        for module in (scene, page, motion_pictures):
             patch.setattr(module, "render", coarse)
         yield

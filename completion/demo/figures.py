@@ -32,8 +32,7 @@ def measure_demo(demo: Demo) -> list[Metric]:
     seen = cKDTree(half.vertices).query(true)[0] < 2 * demo.amounts.resolution
     rows += [Metric("completion, hidden: mean error", MM * mean_over_area(apart, template, ~seen), "mm"),
              Metric("completion, seen: mean distance to the true surface",
-                    MM * mean_over_area(surface, template, seen), "mm"),
-             Metric("completion: share of the body that was seen", 100 * float(seen.mean()), "%", detail=True)]
+                    MM * mean_over_area(surface, template, seen), "mm")]
     # the walk, followed by its markers
     motion, faces = demo.motion, demo.person.mesh.faces
     walked = [distance(body, demo.places.transfer(true_body, faces))

@@ -22,7 +22,6 @@ from scanprep.pictures.page import Page
 from ...motion import Motion
 from ...motion_pictures import (
     chart_residuals,
-    chart_states,
     frame_panes,
     marker_rows,
     moving_pane,
@@ -202,17 +201,11 @@ def motion_page(motion: Motion, subject: Subject, markers: MarkerSequence, name:
     page.section("Markers").chart(chart_residuals(motion), "distance of the markers to where the body puts them")
     page.bodies(frame_panes(motion, subject, markers.positions, worst_frames(motion, 5)),
                 "where the markers are farthest off", 300)
-    # which markers were seen and trusted, over time and in a table
-    used = np.isfinite(motion.residuals).any(axis=0)
-    labels = [label for label, is_used in zip(motion.labels, used, strict=True) if is_used]
-    missing = ~np.isfinite(motion.residuals[:, used])
-    state = np.where(missing, 2, np.where(motion.trusted[:, used], 0, 1))
-    page.chart(chart_states(state, labels, motion.rate, ("#dfe7ee", "#e39b3b", "#8c2f39")),
-               "light: seen; orange: seen, but not believed; red: missing")
     rows = marker_rows(motion.labels, motion.residuals, None, motion.trusted)
     page.table([(*row[:2], *row[3:]) for row in rows],
                ("marker", "mean distance (mm)", "95th percentile (mm)", "seen (%)", "believed (%)"))
-    unused = [label for label in motion.labels if label not in labels]
+    used = np.isfinite(motion.residuals).any(axis=0)
+    unused = [label for label, is_used in zip(motion.labels, used, strict=True) if not is_used]
     if unused:
         page.text(f"Not used, because the layout does not know them or they were never seen: {', '.join(unused)}.")
     return page.section("Figures").figures(metrics)

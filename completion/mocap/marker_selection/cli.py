@@ -139,11 +139,4 @@ def design_page(design: MarkerDesign, model: BodyModel, candidates: MarkerLayout
     page.text(f"Chosen: {', '.join(chosen) or 'none'}." + (f" Kept: {', '.join(keep)}." if keep else ""))
     page.section("Error and number of markers").chart(chart_curve(design), "root mean squared distance of all vertices "
                                                       "of all bodies; linearised")
-    page.section("Figures").figures(metrics)
-    page.section("Order", "In which markers, or pairs, came or went, and the error after each.")
-    for curve in design.curves:
-        steps = zip(curve.steps, curve.counts[1:].tolist(), (1000 * curve.rmse[1:]).tolist(), strict=True)
-        page.text(f"{curve.name}:")
-        page.table([(count, " ".join(labels), f"{rmse:.2f}") for labels, count, rmse in steps],
-                   ("markers", "came" if curve.name == "added" else "went", "RMSE (mm)"))
-    return page
+    return page.section("Figures").figures(metrics)
