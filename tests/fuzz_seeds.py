@@ -332,9 +332,6 @@ def _add_tables(body: Mesh, place: Any, add: Any, text: Any) -> None:
     text("views/cameras.json", '{"a": [0, 1, 2.5]}', lambda path: _read_views(path.parent, None),
          lambda found: finite(*(camera for _, camera in found)))
     marked = np.arange(len(body.vertices)) % 3 == 0
-    np.save(path := place("mask.npy"), marked)
-    add(path, lambda path: read_mask(path, body.vertices))
-    for name, content in (("mask.json", json.dumps(marked.tolist())), ("numbers.json", "[0, 3, 9]")):
-        text(name, content, lambda path: read_mask(path, body.vertices))
+    text("mask.json", "[0, 3, 9]", lambda path: read_mask(path, body.vertices))
     write_points(path := place("painted.ply"), PointCloud(body.vertices, None, np.where(marked[:, None], [1, 0, 0], 1)))
     add(path, lambda path: read_mask(path, body.vertices))

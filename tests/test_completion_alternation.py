@@ -68,17 +68,6 @@ def test_turns_reach_the_truth_when_every_point_is_known():
     np.testing.assert_allclose(now.R, true.R, atol=0.08)               # how Q turns with R is ignored
 
 
-def test_twists_without_damping_are_those_of_each_part_and_with_much_they_are_one():
-    rng = np.random.default_rng(0)
-    e = edges(MODEL.template.vertices, MODEL.template.faces)
-    part = MODEL.skeleton.part_of_face
-    turn = rng.normal(0, 1e-4, (4, 3))
-    v = e @ np.swapaxes(rotations.exp(turn), -1, -2)[part]
-    np.testing.assert_allclose(solve_twists(MODEL.skeleton, part, e, v, 0.0), turn, atol=1e-7)
-    stiff = solve_twists(MODEL.skeleton, part, e, v, 1e6)
-    np.testing.assert_allclose(stiff, np.tile(stiff[0], (4, 1)), atol=1e-9)
-
-
 def test_damped_twists_are_where_the_gradient_of_their_energy_vanishes():
     """[SCAPE] Eq. 11, a parabola: central differences are exact."""
     skeleton, part, rng = MODEL.skeleton, MODEL.skeleton.part_of_face, np.random.default_rng(1)

@@ -48,7 +48,7 @@ def place(tmp_path_factory):
         write_mesh(place / f"{name}.ply", Mesh(view.vertices, view.faces, np.full(view.vertices.shape, 0.2)))
         write_points(place / f"{name}.xyz", PointCloud(bare))
     write_landmarks(place / "one.landmarks.json", points)
-    np.save(place / "mask.npy", np.arange(10))
+    (place / "mask.json").write_text(json.dumps(list(range(10))))
     return place
 
 
@@ -69,7 +69,7 @@ def told(folder):
 def test_two_coloured_views_make_one_body_and_a_page(place, tmp_path, capsys):
     out = tmp_path / "out"
     assert run(place / "one.ply", place / "two.ply", "-m", place / "model.npz", "--subject", "template", "-o", out,
-               "--mask", place / "mask.npy", *quick(place)) == 0
+               "--mask", place / "mask.json", *quick(place)) == 0
     metrics, written = told(out)
     assert metrics["views"] == 2 and metrics["landmarks used"] == 7
     assert metrics["share of the body that was measured"] > 70
@@ -195,10 +195,10 @@ def test_what_is_finished_is_skipped_and_what_changed_is_done_anew(place, folder
 @pytest.mark.parametrize("words, message", [
     (("none.ply",), "none.ply: no such file"),
     (("one.ply", "--landmarks", "none.json"), "none.json: no such file"),
-    (("one.ply", "--mask", "none.npy"), "none.npy: no such file"),
+    (("one.ply", "--mask", "none.json"), "none.json: no such file"),
     (("one.ply", "--mask", "long.json"), "long.json: element 0: expected a point of 0.."),
     (("one.ply", "--config", "wing.toml"), "ignored_parts: expected names of"),
-    (("one.ply", "two.ply", "--mask", *["mask.npy"] * 3), "expected one file, or one for each of the 2 views, got 3"),
+    (("one.ply", "two.ply", "--mask", *["mask.json"] * 3), "expected one file, or one for each of the 2 views, got 3"),
     (("one.ply", "--subject", "none.json"), "none.json: no such file"),
 ])
 def test_what_cannot_be_used_is_named(place, tmp_path, capsys, monkeypatch, words, message):

@@ -25,8 +25,6 @@ def full(pattern, words, change=str):
 SMALL = [word.lower() for word in LIMBS]
 SETS = {
     "COCO": ["nose", *full("{}_{}", ["eye", "ear", *SMALL])],
-    "COCO with blanks": ["Nose", *full("{} {}", ["eye", "ear", *SMALL], str.capitalize)],
-    "HALPE_26": ["Nose", "Head", "Neck", "Hip", *both("{}{}", ["Eye", "Ear", *LIMBS, "BigToe", "SmallToe", "Heel"])],
     "HALPE_26 of Pose2Sim": ["Hip", "Neck", "Head", "Nose", *both("{}{}", [*LIMBS, "BigToe", "SmallToe", "Heel"])],
     "BODY_25": ["Nose", "Neck", "MidHip", *both("{}{}", ["Eye", "Ear", *LIMBS, "BigToe", "SmallToe", "Heel"])],
     "MediaPipe": ["NOSE", "MOUTH_LEFT", "MOUTH_RIGHT",
@@ -41,7 +39,6 @@ SETS = {
     "SMPL": ["pelvis", "spine1", "spine2", "spine3", "neck", "head", 
              *full("{}_{}", [*SMALL, "collar", "foot", "hand"])],
     "joint centres": [f"{side}{joint}JC" for side in "LR" for joint in "HKASEW"],
-    "hips and below": ["MidHip", *both("{}{}", ["Hip", "Knee", "Ankle", "BigToe", "SmallToe", "Heel"])],
     "head and above": ["Nose", *both("{}{}", ["Eye", "Ear", "Shoulder", "Elbow", "Wrist"])]}
 SKIN = {
     "Plug-in Gait with joint centres": [*LAYOUT.labels, *both("{}{}", ["HJC", "KJC", "AJC"]), "PELO"],

@@ -16,7 +16,7 @@ from scanprep.geometry.landmark_writing import marker_set
 
 @pytest.fixture(scope="module")
 def place(tmp_path_factory):
-    """A folder with a recording, raw.c3d, true.c3d with its labels, and the person's betas."""
+    """A folder with a recording, raw.c3d, and true.c3d with its labels."""
     folder = tmp_path_factory.mktemp("label")
     _, layout, places = person(2, frames=24)
     places = places.copy()
@@ -24,9 +24,6 @@ def place(tmp_path_factory):
     write_markers(folder / "true.c3d", MarkerSequence(places, layout.labels, RATE))
     points, _ = shuffled(places)
     write_markers(folder / "raw.c3d", unnamed(points))
-    write_markers(folder / "raw.trc", unnamed(points))
-    rng = np.random.default_rng(2)
-    (folder / "betas.json").write_text(json.dumps(rng.normal(size=8).tolist()))
     return folder
 
 
@@ -55,14 +52,6 @@ def test_the_recording_is_labelled_and_nothing_is_lost(out):
     told = json.loads((out / "labelled.c3d.report.json").read_text())
     assert told["judgement"]["verdict"] == "good", told["judgement"]
     assert "Where it is unsure" in (out / "labelled.report.html").read_text()
-
-
-@pytest.mark.slow
-def test_a_known_person_and_other_formats(place, capsys):
-    assert run(place, "label", "raw.trc", "--layout", "cmu41", "--subject", "betas.json", "-o", "known.csv") == 0
-    true, found = read_markers(place / "true.c3d"), read_markers(place / "known.csv")
-    same = np.isclose(found.select(true.labels).positions, true.positions, atol=1e-4, equal_nan=True).all(axis=2)
-    assert same.mean() > 0.98
 
 
 @pytest.mark.parametrize(("words", "said"), [

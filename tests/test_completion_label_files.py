@@ -24,10 +24,9 @@ from completion.mocap.files.c3d import point_table
 from completion.mocap.files.c3d_points import rename_points
 from completion.mocap.files.markers import MarkerFileError, read_marker_points
 from completion.mocap.labelling import recording
-from completion.mocap.labelling.corrections import COLUMNS, read_corrections
-from completion.mocap.labelling.label import GHOST, UNKNOWN
+from completion.mocap.labelling.corrections import COLUMNS
+from completion.mocap.labelling.label import UNKNOWN
 from completion.mocap.labelling.recording import columns_of_labels
-from completion.mocap.labelling.tracks import link_points
 from completion.mocap.mosh import cli as mosh_cli
 from completion.mocap.mosh.call import MoshCall
 from completion.mocap.mosh.mend import MoshApp
@@ -165,29 +164,6 @@ def test_whole_numbers_and_other_counts(here):
     for wrong in (source[:3], source + 3):
         with pytest.raises(MarkerFileError, match="expected a file of"):
             rename_points(folder / "whole.c3d", data, ["E", "D", "none", "A"], wrong)
-
-
-def test_the_table_says_what_was_found_and_gives_it_back(here):
-    folder, _ = here
-    assert label("raw.c3d", "-o", "out.c3d") == 0
-    rows = rows_of(folder / "out.labels.csv")
-    points = read_marker_points("raw.c3d")
-    tracks = link_points(points.positions, points.rate)
-    assert {row["fixed"] for row in rows} == {""} and {row["label"] for row in rows} == {*MARKERS, ""}
-    covered = np.zeros(tracks.shape, dtype=int)
-    for row in rows:
-        here_ = tracks[int(row["begin"]):int(row["end"]) + 1] == int(row["track"])
-        covered[int(row["begin"]):int(row["end"]) + 1] += here_
-    np.testing.assert_array_equal(covered, points.seen)              # every observation is in one row
-    for row in rows:
-        row["fixed"] = "yes"
-    correct(folder / "out.labels.csv", **{f"t{row['track']}": row["label"] for row in rows})
-    known = read_corrections(folder / "out.labels.csv", tracks, MARKERS)
-    columns = np.where(known >= 0, known, -1)
-    np.testing.assert_allclose(
-        [np.nanmean(points.positions[columns == i], axis=0) for i in range(34)],
-        [np.nanmean(worm_points(folder)[2][0][:, i], axis=0) for i in range(34)], atol=1e-6)
-    assert (known == GHOST).sum() == points.seen.sum() - (known >= 0).sum() == FRAMES - 4
 
 
 def test_corrections_go_back_in(here):
@@ -389,16 +365,3 @@ def test_mosh_goes_on_with_the_labels(here, monkeypatch):
     for more in ({}, {"exaggeration": 1.5}):
         assert mosh(folder, "walk.csv", "-o", "out", "--unlabelled", "--unit", "cm", **more) == 0
     assert knows.called == 1
-
-
-def test_mosh_with_labels_that_are_doubtful(here, monkeypatch):
-    folder, knows = here
-    monkeypatch.setattr(mosh_cli, "MoshTask", QuietWork)
-    knows.confidence = 0.5
-    assert mosh(folder, "raw.c3d", "-o", "out", "--unlabelled") == 0
-    judged = json.loads((folder / "out" / "report.json").read_text())["judgement"]
-    assert judged["verdict"] == "check"
-    assert "labels of raw: 100% of the labels are doubtful" in " ".join(judged["reasons"])
-    virtual = ezc3d.c3d(str(folder / "out" / "raw" / "raw" / "virtual.c3d"))
-    assert virtual["data"]["analogs"].shape[1:] == (2, 4 * FRAMES)
-    assert virtual["parameters"]["POINT"]["LABELS"]["value"][:36] == [*MARKERS, "*1", "Angle"]

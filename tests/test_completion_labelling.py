@@ -5,8 +5,6 @@ from labelling import RATE, person, share_right, shuffled, unnamed
 
 from completion.mocap.labelling.assignment import find_displaced, mean_offsets
 from completion.mocap.labelling.label import GHOST, UNKNOWN, label_markers, label_people
-from completion.mocap.labelling.layout_order import order_by_layout
-from completion.mocap.labelling.separate import separate_people
 from completion.mocap.labelling.tracks import has_tracks, link_points
 from completion.mocap.marker_sets.layout import MarkerLayout
 
@@ -113,16 +111,6 @@ def test_tracks_are_cut_rather_than_confused():
     assert has_tracks(np.stack([a, b + 5], axis=1), 100.0)
 
 
-def test_a_plate_is_told_by_its_shape():
-    rng = np.random.default_rng(0)
-    usual = np.concatenate([rng.uniform(-0.03, 0.03, (4, 3)), rng.uniform(0.5, 0.6, (4, 3))])
-    part = np.repeat([0, 1], 4)
-    true = np.array([2, 0, 1, 3, 4, 5, 6, 7])
-    assert order_by_layout(usual[true] + [0.0, 0.0, 0.06], usual, part).tolist() == true.tolist()
-    same = np.arange(8)
-    assert order_by_layout(usual + rng.normal(size=usual.shape) * 0.004, usual, part).tolist() == same.tolist()
-
-
 def test_a_marker_that_is_worn_elsewhere_is_found_on_its_part():
     rng = np.random.default_rng(0)
     T = 40
@@ -142,16 +130,6 @@ def test_a_marker_that_is_worn_elsewhere_is_found_on_its_part():
     assert np.allclose(found[2], off, atol=0.005) and not found[:2].any()
     offsets, deviations = mean_offsets(points, np.tile([0, 1, 2], (T, 1)), places, turns)
     assert np.allclose(offsets[2], off, atol=1e-9) and np.allclose(deviations, 0, atol=1e-9)
-
-
-def test_people_who_stand_apart_are_told_apart():
-    rng = np.random.default_rng(0)
-    near = rng.normal(size=(3, 12, 3)) * [0.2, 0.2, 0.5]
-    points = np.concatenate([near, near + [2.0, 0, 0]], axis=1)
-    frames, groups = separate_people(points, 2)
-    assert len(frames) == 3 and {len(group) for pair in groups for group in pair} == {12}
-    with pytest.raises(ValueError, match="no frame in which 3 people"):
-        separate_people(points[:, :20], 3)
 
 
 @pytest.mark.slow

@@ -56,6 +56,16 @@ def test_analog_values_are_counted_by_the_size_of_the_file(tmp_path):
         same(read_markers(path))
 
 
+@pytest.mark.parametrize("processor", [85, 86])
+@pytest.mark.parametrize("scale", [-1.0, 0.1])
+def test_numbers_of_other_processors_are_read(tmp_path, processor, scale):
+    path = c3d(tmp_path, processor=processor, scale=scale)
+    same(read_markers(path), atol=6e-5 if scale > 0 else 1e-6)
+    if processor == 85:                                              # big-endian files ezc3d does not read
+        theirs = pytest.importorskip("ezc3d").c3d(str(path))["data"]["points"][:3].transpose(2, 1, 0)
+        np.testing.assert_allclose(theirs, 1000 * read_markers(path).positions, atol=1e-3)
+
+
 def test_the_last_parameter_may_link_into_the_points(tmp_path):
     same(read_markers(c3d(tmp_path, header={"link": 530}, scale=0.1)), atol=6e-5)
 

@@ -9,7 +9,6 @@ from completion import MoshConfig, PersonConfig, animate, find_person, load_layo
 from completion.mocap.files.markers import MarkerSequence
 from completion.mocap.marker_sets.layout import MarkerLayout
 from completion.mocap.pose.judgement import find_distrusted_markers, markers_told
-from completion.mocap.pose.marked_body import AnimateConfig
 from completion.mocap.subject.attachment import latent_markers
 from completion.mocap.subject.misplaced_markers import (
     MisplacedMarkers,
@@ -176,15 +175,6 @@ def test_frames_of_the_paper_are_drawn_at_random():
     np.testing.assert_array_equal(first, choose_frames(positions, PersonConfig(published=True, frames=7)))
     assert len(set(first)) == 7 and (np.diff(first) > 0).all()
     assert not np.array_equal(first, choose_frames(positions, PersonConfig(frames=7)))
-
-
-def test_weights_of_the_paper_are_those_of_the_engine():
-    """[MoSh] Eq. 17, 21, 22: a residual of 1/√λ costs one."""
-    found = AnimateConfig.from_weights(data=0.25, pose=0.7, velocity=4.0)
-    assert found.marker_sd == pytest.approx(0.02) and found.prior_weight == 0.7
-    assert found.angle_acceleration == pytest.approx(0.5 * 120**2)
-    ours = MoshConfig().poses                    # those of `animate`, but for markers that are held closer
-    assert (ours.prior_weight, ours.angle_acceleration) == (AnimateConfig().prior_weight, 60.0)
 
 
 def test_everything_together():

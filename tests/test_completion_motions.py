@@ -110,11 +110,6 @@ def test_bad_motions_are_one_clear_line(place, tmp_path, capsys, name, make, wor
     assert "pickle=" not in said[0] and not (tmp_path / "out" / "motion.npz").exists()
 
 
-def test_markers_of_a_motion_are_not_asked_for(place, tmp_path, capsys):
-    assert run(place, place / "many" / "theirs.bvh", "--layout", "cmu41", "-o", tmp_path / "out") == 1
-    assert "a motion has no markers; leave out --layout" in capsys.readouterr().err
-
-
 def test_a_motion_of_another_kind_of_model_says_what_to_do(tmp_path):
     np.savez(tmp_path / "a.npz", poses=np.zeros((2, 156)), trans=np.zeros((2, 3)), mocap_frame_rate=30.0,
              surface_model_type="smplh")

@@ -264,16 +264,6 @@ def storage_file(path):
     return path
 
 
-def test_a_storage_file_says_what_it_holds(tmp_path):
-    lines = storage_file(tmp_path / "a.mot").read_text().splitlines()
-    assert {"version=1", "nRows=3", "nColumns=8", "inDegrees=yes", "No parts for: knee_r."} <= {*lines}
-    end = lines.index("endheader")
-    assert lines[end + 1].split("\t") == ["time", "pelvis_tilt", "pelvis_list", "pelvis_rotation", "pelvis_tx",
-                                          "pelvis_ty", "pelvis_tz", "hip_flexion_r"]
-    rows = np.array([line.split("\t") for line in lines[end + 2:]], float)
-    np.testing.assert_allclose(rows[:, [0, 1, 7]], [[0, 0, 3], [0.02, 4, 7], [0.04, 8, 11]])
-
-
 def test_joint_centres_are_further_points_of_the_c3d(tmp_path, original):
     ezc3d = pytest.importorskip("ezc3d")
     faults, rng = found(original), np.random.default_rng(8)

@@ -10,7 +10,7 @@ from completion.mocap.marker_sets.layout import MarkerLayout
 from completion.mocap.pose.follow import AnimateConfig, animate, low_pass
 from completion.mocap.pose.foot_contact import Floor, FootContact
 from completion.mocap.pose.judgement import marker_speed
-from completion.mocap.pose.marked_body import MarkedBody, marker_weights
+from completion.mocap.pose.marked_body import MarkedBody
 from completion.mocap.pose.part_shapes import PartShapes
 from completion.mocap.pose.stream import KalmanPrediction, MarkerStream
 from completion.mocap.pose.swaps import LabelWatch
@@ -133,23 +133,6 @@ def test_exchanged_labels_are_put_right_and_reported(subject, layout, sway, way)
     wrong = np.zeros_like(trusted)
     wrong[20:40, [0, far]] = True
     np.testing.assert_array_equal(trusted, ~wrong)
-
-
-def test_the_watch_changes_its_mind_only_with_reason():
-    places = np.array([[0, 0, 0], [0, 0, 0.3], [0.5, 0, 0], [0.5, 0.4, 0], [0, 0.8, 0]])
-    watch = LabelWatch(5, 0.06)
-    assert (watch.update(places, places + 0.002) == np.arange(5)).all()
-    wrong = places[[0, 3, 2, 1, 4]]
-    np.testing.assert_array_equal(watch.update(places, wrong), [0, 3, 2, 1, 4])
-    hidden = wrong.copy()
-    hidden[1] = np.nan
-    np.testing.assert_array_equal(watch.update(places, hidden), [0, 3, 2, 1, 4])   # nothing new was seen
-    np.testing.assert_array_equal(watch.update(places, places), np.arange(5))
-    stray = places.copy()
-    stray[2] += 1
-    assert (watch.update(places, stray) == np.arange(5)).all()
-    weights, believed = marker_weights(places, stray, 0.01, 0.06)
-    assert weights[2] < 1e-3 * weights[0] and believed.tolist() == [True, True, False, True, True]
 
 
 @pytest.mark.parametrize("rate", [25.0, 120.0])

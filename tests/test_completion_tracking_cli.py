@@ -47,27 +47,20 @@ def test_steps_and_time_stamps_leave_no_gaps(tmp_path):
     assert FrameFolder(tmp_path / "b").numbers == [100023, 100107, 100190]
 
 
-def test_cameras_in_folders_or_by_pattern(tmp_path):
-    touch(tmp_path / "a", "left/1.xyz", "left/2.xyz", "right/2.xyz", "right/3.xyz")
-    touch(tmp_path / "b", "7_left.xyz", "8_left.xyz", "8_right.xyz")
-    by_folder, by_name = FrameFolder(tmp_path / "a"), FrameFolder(tmp_path / "b", "{frame}_{camera}.xyz")
-    assert by_folder.cameras == by_name.cameras == ("left", "right")
-    assert [len(views) for views in by_folder] == [1, 2, 1] and [len(views) for views in by_name] == [1, 2]
-    assert [p.name for p in by_name.paths(1)] == ["8_left.xyz", "8_right.xyz"]
+def test_every_camera_has_a_folder(tmp_path):
+    touch(tmp_path, "left/1.xyz", "left/2.xyz", "right/2.xyz", "right/3.xyz")
+    found = FrameFolder(tmp_path)
+    assert found.cameras == ("left", "right") and [len(views) for views in found] == [1, 2, 1]
 
 
 def test_a_folder_that_does_not_fit_is_explained(tmp_path):
     touch(tmp_path / "same", "a_1.xyz", "b_1.xyz")
     touch(tmp_path / "none", "readme.md")
     touch(tmp_path / "unnamed", "scan.xyz")
-    for folder, pattern, message in (("missing", None, "no such folder"), ("none", None, "found none"),
-                                     ("same", None, r"a_1\.xyz and b_1\.xyz are both frame 1"),
-                                     ("unnamed", None, "number of the frame"), ("same", "{camera}.xyz", "--cameras"),
-                                     ("same", "x{camera}_{frame}.xyz", "no file is named")):
+    for folder, message in (("missing", "no such folder"), ("none", "found none"), ("same/a_1.xyz", "found a file"),
+                            ("same", r"a_1\.xyz and b_1\.xyz are both frame 1"), ("unnamed", "number of the frame")):
         with pytest.raises(ValueError, match=message):
-            FrameFolder(tmp_path / folder, pattern)
-    with pytest.raises(ValueError, match="found a file"):
-        FrameFolder(tmp_path / "same" / "a_1.xyz")
+            FrameFolder(tmp_path / folder)
 
 
 def test_a_bad_file_is_a_camera_that_saw_nothing_and_is_named_once(tmp_path):

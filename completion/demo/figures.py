@@ -8,13 +8,12 @@ from model.learning.scape import judge_model
 from scanprep.cli import MM
 from scanprep.console import Metric
 from scanprep.dataset import RegisteredSet
-from scanprep.geometry.surface import Surface
 from scanprep.judgement import Judgement, judge_many
 from scanprep.pipeline.page import judge_set, judge_whole
 
 from ..mocap.pose.judgement import motion_doubts
 from .chain import Demo
-from .truth import distance, joint_errors, mean_over_area, rand_index, surface_error
+from .truth import distance, mean_over_area, surface_error
 
 NAMED = ("head", "hand_left", "hand_right", "foot_left", "foot_right")     # parts that exports of motions need
 
@@ -33,8 +32,7 @@ def measure_demo(demo: Demo) -> list[Metric]:
     seen = cKDTree(half.vertices).query(true)[0] < 2 * demo.amounts.resolution
     rows += [Metric("completion, hidden: mean error", MM * mean_over_area(apart, template, ~seen), "mm"),
              Metric("completion, seen: mean distance to the true surface",
-                    MM * mean_over_area(surface, template, seen), "mm"),
-             Metric("completion: share of the body that was seen", 100 * float(seen.mean()), "%", detail=True)]
+                    MM * mean_over_area(surface, template, seen), "mm")]
     # the walk, followed by its markers
     motion, faces = demo.motion, demo.person.mesh.faces
     walked = [distance(body, demo.places.transfer(true_body, faces))
@@ -46,17 +44,11 @@ def measure_demo(demo: Demo) -> list[Metric]:
     means = {name: mean_over_area(off, template) for name, (off, _) in demo.off.items()}
     slid = [mean_over_area(off, template) for _, off in demo.off.values()]
     worst = max(means, key=means.__getitem__)
-    skeleton = demo.model.skeleton
-    true_faces = Surface(demo.rest.mesh).closest(template.corners.mean(axis=1)).faces
-    agreement = rand_index(skeleton.part_of_face, demo.rest.part_of_face[true_faces], template.face_areas)
     return [*rows, Metric(f"registration: {len(means)} scans, mean distance to the true surface",
                           MM * float(np.mean(list(means.values()))), "mm"),
             Metric(f"registration: the same, worst scan ({worst})", MM * means[worst], "mm"),
             Metric("points registered beside their true place, mean", MM * float(np.mean(slid)), "mm"),
-            Metric("skeleton: parts found (the people have 16)", len(skeleton.parents)),
-            Metric("skeleton: agreement with the true parts (1 is the same, 0 is chance)", agreement, detail=True),
-            Metric("skeleton: joints to the nearest true one, mean",
-                   MM * float(joint_errors(skeleton, demo.rest).mean()), "mm")]
+            Metric("skeleton: parts found (the people have 16)", len(demo.model.skeleton.parents))]
 
 
 def judge_demo(demo: Demo) -> Judgement:

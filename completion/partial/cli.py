@@ -50,8 +50,8 @@ def complete_scan(scans: ScansArg = (), *, output: Output, model: ModelOrNone = 
         subject: Whose body it is: "template" for the one the model's poses were learned from, betas in JSON or .npz,
             or a mesh in the model's triangles. Without it the shape is found too.
         template_landmarks: Where these landmarks are on the model's template; else those kept in the model.
-        mask: Which points are clothing or hair: .npy or .json of booleans or of the numbers of points, or a
-            mesh or cloud in which they are painted in a colour. One file, or one for each view; for a folder of
+        mask: Which points are clothing or hair: .json of the numbers of points, or a mesh or cloud in which they are
+            painted in a colour. One file, or one for each view; for a folder of
             scans, the folder of such files. Without it, what is 16 mm and more off skin is found, and listed in
             mask.json, to be corrected; a file without points says that all is skin.
         unit: Unit of the scan and landmarks; "unknown": it is found together with the body.

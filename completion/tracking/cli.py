@@ -29,9 +29,9 @@ FramesArg = Annotated[Path, Place("FRAMES")]
 
 
 def track_frames(frames: FramesArg, output: Output, model: ModelOrNone = None, rate: Positive = 30.0,
-                 cameras: str | None = None, landmarks: Path | None = None, subject: str | None = None,
-                 template_landmarks: Path | None = None, unit: PersonUnit | None = None, surfaces: bool = False,
-                 config: TrackConfig = TrackConfig(), *, space: Workspace) -> Outcome:
+                 landmarks: Path | None = None, subject: str | None = None, template_landmarks: Path | None = None,
+                 unit: PersonUnit | None = None, surfaces: bool = False, config: TrackConfig = TrackConfig(), *,
+                 space: Workspace) -> Outcome:
     """The motion of a person from frames of points, without markers.
 
     Example: scape track frames -m model.npz --rate 30 -o walk
@@ -47,7 +47,6 @@ def track_frames(frames: FramesArg, output: Output, model: ModelOrNone = None, r
             joint_centres.csv, residuals.csv and report.html to.
         model: Model of `scape learn`; without it that of the built-in people.
         rate: Frames per second.
-        cameras: How files of several cameras in one folder are named, such as "cam{camera}_{frame}.ply".
         landmarks: Named points in the first frame; without them the search starts from typical poses.
         subject: Whose body it is: "template" for the one the model's poses were learned from, betas in JSON or .npz,
             or a mesh in the model's triangles. Without it the shape is found from the first frames.
@@ -60,7 +59,7 @@ def track_frames(frames: FramesArg, output: Output, model: ModelOrNone = None, r
     from ..mocap.movement import pace_doubts
     from .report import track_page
 
-    found = FrameFolder(frames, cameras, unit)
+    found = FrameFolder(frames, unit)
     loaded, name = read_model(model)
     body = body_of(loaded, subject, unit)
     check_unit(_points(found[spread_indices(len(found), 3)[1]]), loaded.template.vertices, f"{frames}: a frame is")

@@ -8,7 +8,6 @@ from pathlib import Path
 
 import numpy as np
 
-from scanprep.arguments import UsageError
 from scanprep.batch.workspace import Workspace
 from scanprep.geometry.files import (
     ENDINGS,
@@ -29,18 +28,18 @@ from .sequence import BodyTracker, TrackedFrame, TrackerState, without_points
 
 
 class FrameFolder:
-    """Frames in the order of the numbers in their names: in one folder, one folder per camera, or named by a pattern.
+    """Frames in the order of the numbers in their names: in one folder, or one folder per camera.
 
     A missing number is a frame in which nothing was seen.
     """
 
-    def __init__(self, folder: Path, pattern: str | None = None, unit: str | None = None) -> None:
+    def __init__(self, folder: Path, unit: str | None = None) -> None:
         self.folder, self.unit = folder, unit
         self.problems: list[str] = []
         if not folder.is_dir():
             raise ValueError(f"{folder}: " + ("expected a folder of frames, found a file" if folder.exists()
                                               else "no such folder"))
-        self._paths = _by_pattern(folder, pattern) if pattern else _by_folder(folder)
+        self._paths = _by_folder(folder)
         self.cameras = tuple(self._paths)
         # at most as many missing numbers as frames; with more, the numbers only give the order
         order = sorted({n for files in self._paths.values() for n in files})
@@ -87,31 +86,12 @@ def _by_folder(folder: Path) -> dict[str, dict[int, Path]]:
             own, number = files.setdefault(camera, {}), int(digits[-1])
             if number in own:
                 raise ValueError(f"{place}: {own[number].name} and {path.name} are both frame {number}; put cameras "
-                                 "into folders of their own, or name them with --cameras")
+                                 "into folders of their own")
             own[number] = path
     if not files:
         raise ValueError(f"{folder}: expected frames ({', '.join(ENDINGS)}) in it, or in one folder for each camera, "
                          "found none")
     return files
-
-
-def _by_pattern(folder: Path, pattern: str) -> dict[str, dict[int, Path]]:
-    """Map each camera to its files by number, for names such as "cam{camera}_{frame}.ply"."""
-    if "{camera}" not in pattern or "{frame}" not in pattern:
-        raise UsageError(f"--cameras: expected a name with {{camera}} and {{frame}} in it, got '{pattern}'")
-    expression = re.escape(pattern).replace(r"\{camera\}", "(?P<camera>.+?)").replace(r"\{frame\}", r"(?P<frame>\d+)")
-    files: dict[str, dict[int, Path]] = {}
-    for path in sorted(folder.rglob("*")):
-        match = re.fullmatch(expression, path.relative_to(folder).as_posix())
-        if match and path.is_file():
-            own, number = files.setdefault(match["camera"], {}), int(match["frame"])
-            if number in own:
-                raise ValueError(f"{folder}: {own[number].name} and {path.name} are both frame {number} of camera "
-                                 f"{match['camera']}")
-            own[number] = path
-    if not files:
-        raise ValueError(f"{folder}: no file is named as --cameras '{pattern}' says")
-    return dict(sorted(files.items()))
 
 
 @dataclass(frozen=True, eq=False)

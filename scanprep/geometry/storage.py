@@ -287,13 +287,6 @@ def names_in(path: str | Path, what: str = "an .npz file") -> tuple[str, ...]:
         return tuple(name[:-4] for name in archive.namelist() if name.endswith(".npy"))
 
 
-def load_array(path: str | Path) -> np.ndarray:
-    """Read the array of an `.npy` file; StorageError if it is missing, damaged or holds objects."""
-    check_regular(path)
-    with taking_apart(path, "an array of NumPy"), open(path, "rb") as stream:
-        return _array(stream, os.fstat(stream.fileno()).st_size, "")
-
-
 def kind_of_stored(path: str | Path) -> str:
     """Read the kind of a file of `save` from its header; StorageError without one."""
     return str(load_header(path, "scapekit").get("kind"))

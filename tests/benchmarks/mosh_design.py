@@ -63,7 +63,7 @@ def exchanged(linear: LinearBodies, groups: Groups, chosen: list[int], free: np.
               ) -> tuple[list[int], float]:
     """The set after a round of exchanges, and its error."""
     sets = MarkerSets(linear, groups, [g for g, group in enumerate(groups) if set(group) <= set(chosen)])
-    exchange(sets, free, 1)
+    exchange(sets, free)
     return sorted(i for g in np.flatnonzero(sets.inside) for i in groups[g]), sets.rmse
 
 

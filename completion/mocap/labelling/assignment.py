@@ -73,14 +73,23 @@ def assign_by_places(points: np.ndarray, tracks: np.ndarray, known: np.ndarray, 
         chosen, _ = assign_columns(cost, ALONE)
         rows = np.flatnonzero(chosen >= 0)
         columns[t, rows] = seen[chosen[rows]]
-        # confidence beside the next best: this point as another marker, another point as this marker, or none
-        here = cost[rows, chosen[rows]]
-        others = cost.copy()
-        others[rows, chosen[rows]] = np.inf
-        rival = np.minimum(np.minimum(others[:, chosen[rows]].min(axis=0, initial=np.inf),
-                                      others[rows].min(axis=1, initial=np.inf)), ALONE)
-        sure[t, rows] = 1 / (1 + np.exp(np.maximum(here - rival, -50.0)))
+        sure[t] = certainty(cost, chosen, ALONE)
     return columns, sure
+
+
+def certainty(cost: np.ndarray, chosen: np.ndarray, alone: float) -> np.ndarray:
+    """Compute the confidence (L,), 0 to 1, of each match with costs (L, N); 0 without a point.
+
+    It is that beside the next best: this point as another marker, another point as this marker, or none, which costs
+    `alone`.
+    """
+    rows, sure = np.flatnonzero(chosen >= 0), np.zeros(len(cost))
+    if len(rows):
+        here, others = cost[rows, chosen[rows]], cost.copy()
+        others[rows, chosen[rows]] = np.inf
+        rival = np.minimum(np.minimum(others[:, chosen[rows]].min(axis=0), others[rows].min(axis=1)), alone)
+        sure[rows] = 1 / (1 + np.exp(np.clip(here - rival, -50.0, 50.0)))
+    return sure
 
 
 def mean_offsets(points: np.ndarray, columns: np.ndarray, places: np.ndarray, turns: np.ndarray

@@ -211,7 +211,8 @@ class _KeyFrameSolver:
                 forbid(cost, key.known)
                 matches[i] = assign_columns(cost, 0.75)[0]
             for k, (search, (first, end)) in enumerate(zip(self.searches, self.rows, strict=True)):
-                targets = np.stack([_targets(key.points, m[first:end]) for key, m in zip(keys, matches, strict=True)])
+                targets = np.stack([take_points(key.points, row[first:end])
+                                    for key, row in zip(keys, matches, strict=True)])
                 unknowns[k] = _solve(search, unknowns[k], targets, scale)
         solved = []
         for i, key in enumerate(keys):
@@ -298,7 +299,7 @@ class _KeyFrameSolver:
     def _solution(self, search: BodySearch, x: np.ndarray, matches: np.ndarray, points: np.ndarray, off: np.ndarray
                   ) -> Solution:
         """Make a solution; markers without a point keep their last offset, `off` (L, 3)."""
-        new = _targets(points, matches) - search.body.positions(x)
+        new = take_points(points, matches) - search.body.positions(x)
         total = search.judge(x, points, self.scales.judged).misfit * search.body.count
         return Solution(x, matches, np.where(np.isnan(new), off, new), total)
 
@@ -328,7 +329,7 @@ def forbid(cost: np.ndarray, known: np.ndarray) -> None:
     cost[known[labelled], labelled] = taken
 
 
-def _targets(points: np.ndarray, matches: np.ndarray) -> np.ndarray:
+def take_points(points: np.ndarray, matches: np.ndarray) -> np.ndarray:
     """Return the point (L, 3) of each marker, NaN without one."""
     targets = np.full((len(matches), 3), np.nan)
     targets[matches >= 0] = points[matches[matches >= 0]]

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from .assignment import certainty
 from .body_search import assign_columns
 
 # Misses of the prediction by body and last offset on three recordings: at 120 Hz 0.9 to 1.8 mm at the median and 7 to
@@ -72,18 +73,7 @@ def match(expected: Expected, points: np.ndarray, strict: bool) -> tuple[np.ndar
     cost = np.minimum(expected.half_squares(points), 2 * ALONE)
     cost += expected.vagueness(np.inf if strict else 0.5 * ALONE)[:, None]
     chosen, _ = assign_columns(cost, ALONE)
-    return chosen, certainty(cost, chosen)
-
-
-def certainty(cost: np.ndarray, chosen: np.ndarray) -> np.ndarray:
-    """Compute the confidence (L,), 0 to 1, of each match beside the next best of costs (L, N); 0 without a point."""
-    rows, sure = np.flatnonzero(chosen >= 0), np.zeros(len(cost))
-    if len(rows):
-        here, others = cost[rows, chosen[rows]], cost.copy()
-        others[rows, chosen[rows]] = np.inf
-        rival = np.minimum(np.minimum(others[:, chosen[rows]].min(axis=0), others[rows].min(axis=1)), ALONE)
-        sure[rows] = 1 / (1 + np.exp(np.clip(here - rival, -50.0, 50.0)))
-    return sure
+    return chosen, certainty(cost, chosen, ALONE)
 
 
 def shift_groups(expected: Expected, slopes: np.ndarray, covariance: np.ndarray, spread: np.ndarray,

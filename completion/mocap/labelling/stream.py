@@ -10,11 +10,13 @@ from model.linear import Subject
 from ..marker_sets.layout import MarkerLayout
 from ..pose.marked_body import AnimateConfig, MarkedBody, marker_weights, point_system
 from ..pose.stream import KalmanPrediction
+from .assignment import certainty
 from .body_search import ALONE, JUDGED, BodySearch, Placement
-from .follow_points import OWN_PERSON
+from .follow_points import OWN_PERSON, take_points
 from .label import FEWEST, FOUND
 from .limb_watch import LimbWatch
-from .live_matching import SEEN_SD, Expected, certainty, intersect, match, shift_groups
+from .live_matching import ALONE as UNMATCHED
+from .live_matching import SEEN_SD, Expected, intersect, match, shift_groups
 from .tracks import ACCELERATION, BRIDGE
 
 ROUNDS = 3                           # most rounds of matching and solving; one is enough without doubtful labels
@@ -168,7 +170,7 @@ class LabelStream:
             if not (chosen >= 0).any():
                 break
             # one Gauss-Newton step; doubtful markers have less weight at first
-            targets = _take(points, chosen)
+            targets = take_points(points, chosen)
             weights, _ = marker_weights(on_body.places, targets, self.config.marker_sd, self.config.outlier)
             if i == 0 and not doubt:
                 weights = weights * np.maximum(2 * sure - 1, 0.0)
@@ -192,7 +194,7 @@ class LabelStream:
         there = chosen >= 0
         # 2 cm: standard deviation of a marker when the body alone tells the labels
         apart = ((points - places[:, None])**2).sum(axis=-1) / (2 * 0.02**2)
-        alone = certainty(apart, chosen) * np.where(self.watch.doubtful(), 0.5, 1.0)
+        alone = certainty(apart, chosen, UNMATCHED) * np.where(self.watch.doubtful(), 0.5, 1.0)
         # 0.5 s: time constant in which a doubtful label regains confidence
         earned = self.belief + (alone - self.belief) * min(1.0, 1 / (0.5 * self.rate))
         earned = np.where(np.isnan(earned), alone, earned)
@@ -242,7 +244,7 @@ class LabelStream:
         found = self.search.judge(self.search.find(points).x, points, OWN_PERSON.judged)
         found = self.search.restart_limbs(found, points, OWN_PERSON.judged)
         # refine it as closely as `_follow` will
-        targets = _take(points, found.matches)
+        targets = take_points(points, found.matches)
         weights, _ = marker_weights(self.body.positions(found.x), targets, self.config.marker_sd, self.config.outlier)
         x = self.body.solve(found.x[None], targets, weights, SETTLED, 1e-4).x[0]
         return min(found, self.search.judge(x, points, OWN_PERSON.judged), key=lambda one: one.misfit)
@@ -314,10 +316,3 @@ class _Memory:
         self.moving[rows] = dt < self.bridge
         self.velocity[rows] = (at - self.last[rows]) / dt[:, None]
         self.last[rows], self.unseen[rows] = at, 0.0
-
-
-def _take(points: np.ndarray, chosen: np.ndarray) -> np.ndarray:
-    """Return the chosen points (L, 3), NaN where there is none."""
-    targets = np.full((len(chosen), 3), np.nan)
-    targets[chosen >= 0] = points[chosen[chosen >= 0]]
-    return targets

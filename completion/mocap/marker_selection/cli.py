@@ -23,7 +23,6 @@ from scanprep.pictures.shading import Dots
 from ...cli import ModelOrNone, read_model
 from ..marker_sets.layout import MarkerLayout
 from ..marker_sets.named import choose_layout
-from ..marker_sets.symmetry import label_pairs, marker_pairs
 from .candidates import candidate_layout
 from .design import MarkerDesign, design_markers
 from .fits import DesignConfig
@@ -61,17 +60,14 @@ def design(bodies: Path, output: Output, model: ModelOrNone = None, candidates: 
         if kept is not None and not set(kept.labels) <= set(among.labels):
             among = among.merge(kept.without([label for label in kept.labels if label in among.labels]))
     labels = () if kept is None else kept.labels
-    # bodies, posed if wanted, and the partners of the candidates
+    # bodies, posed if wanted
     found, people = _read_bodies(loaded, bodies, unit)
     if config.poses:
         with bar("posing the bodies") as progress:
             found = in_poses(loaded, found, example_poses(loaded, config.poses), progress).reshape(-1, *found.shape[1:])
         people = np.repeat(people, config.poses)
-    partners = label_pairs(among.labels)
-    if (partners == np.arange(len(partners))).all():                 # labels without sides
-        partners = marker_pairs(among, loaded.template)
     with bar("choosing markers") as progress:
-        result = design_markers(loaded, found, among, config, progress, keep=labels, partners=partners, people=people)
+        result = design_markers(loaded, found, among, config, progress, keep=labels, people=people)
     metrics = [Metric("model", name), Metric("bodies", len(found)), Metric("candidates", len(among.labels)),
                Metric("markers", len(result.layout.labels)), Metric("RMSE of all vertices", 1000 * result.rmse, "mm"),
                Metric("the same by full refits", 1000 * result.full, "mm"),
@@ -143,11 +139,4 @@ def design_page(design: MarkerDesign, model: BodyModel, candidates: MarkerLayout
     page.text(f"Chosen: {', '.join(chosen) or 'none'}." + (f" Kept: {', '.join(keep)}." if keep else ""))
     page.section("Error and number of markers").chart(chart_curve(design), "root mean squared distance of all vertices "
                                                       "of all bodies; linearised")
-    page.section("Figures").figures(metrics)
-    page.section("Order", "In which markers, or pairs, came or went, and the error after each.")
-    for curve in design.curves:
-        steps = zip(curve.steps, curve.counts[1:].tolist(), (1000 * curve.rmse[1:]).tolist(), strict=True)
-        page.text(f"{curve.name}:")
-        page.table([(count, " ".join(labels), f"{rmse:.2f}") for labels, count, rmse in steps],
-                   ("markers", "came" if curve.name == "added" else "went", "RMSE (mm)"))
-    return page
+    return page.section("Figures").figures(metrics)

@@ -20,20 +20,9 @@ class DesignCurve:
     """Marker sets of many sizes, each with one marker, or pair, more or less than the one before."""
 
     name: str                        # "removed" from all, "added" to kept ones, or "kept, removed": from the kept ones
-    start: tuple[str, ...]           # labels of the first set
     steps: tuple[tuple[str, ...], ...]    # labels added or removed in every step
     counts: np.ndarray               # (S,) int, markers of each set, the first included
     rmse: np.ndarray                 # (S,), metres, over all vertices and bodies, linearised
-
-    def labels(self, count: int) -> tuple[str, ...]:
-        """Return the set with `count` markers, or the largest smaller one."""
-        below = np.flatnonzero(self.counts <= count)
-        if not len(below):
-            raise ValueError(f"count: expected at least {self.counts.min()}, got {count}")
-        moved = [label for step in self.steps[:int(below[np.argmax(self.counts[below])])] for label in step]
-        if self.name == "added":
-            return (*self.start, *moved)
-        return tuple(label for label in self.start if label not in moved)
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,7 +54,6 @@ class MarkerDesign:
 
 
 FEWEST = 3                           # least markers; fewer do not determine the place of a body
-EXCHANGES = 1                        # rounds in which each marker of the set is compared with those left out
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,8 +66,8 @@ class Choice:
 
 
 def design_markers(model: BodyModel, bodies: np.ndarray, candidates: MarkerLayout, config: DesignConfig | None = None,
-                   progress: Progress | None = None, *, keep: Sequence[str] = (),
-                   partners: np.ndarray | None = None, people: np.ndarray | None = None) -> MarkerDesign:
+                   progress: Progress | None = None, *, keep: Sequence[str] = (), people: np.ndarray | None = None
+                   ) -> MarkerDesign:
     """Find the marker set from which the model estimates the whole surface of some bodies best.
 
     Every body is estimated from each set by itself, with the priors of shape and pose, and markers at their places on
@@ -99,10 +87,7 @@ def design_markers(model: BodyModel, bodies: np.ndarray, candidates: MarkerLayou
     progress : callable, optional
         Called with (done, total).
     keep : sequence of labels, optional
-        Candidates that stay in the set, with their partners.
-    partners : (C,) int, optional
-        Partner of each candidate on the other side, which is added and removed with it, as by `marker_pairs`; without
-        it, partners follow from labels.
+        Candidates that stay in the set, with their partners: left and right, by label, are added and removed together.
     people : (Z,) int, optional
         The person of each body; else the first half of the bodies counts as other people than the second.
 
@@ -131,7 +116,7 @@ def design_markers(model: BodyModel, bodies: np.ndarray, candidates: MarkerLayou
     [MoSh] Eq. 25, Eq. 26, Eq. 27
     """
     config = config or DesignConfig()
-    groups = symmetric_groups(candidates.labels, partners)
+    groups = symmetric_groups(candidates.labels)
     kept = _groups_to_keep(candidates, groups, keep, config)
     # fit and linearise, and split the people into halves
     total = 2 * len(bodies) + 2 * len(candidates.labels)
@@ -157,9 +142,8 @@ def design_markers(model: BodyModel, bodies: np.ndarray, candidates: MarkerLayou
     full = float(np.sqrt(vertex_errors(model, fits.refit(chosen, config), bodies).mean()))
     # collect the result, with labels in place of numbers
     labels = candidates.labels
-    curves = tuple(DesignCurve(name, tuple(labels[i] for i in _members(groups, path.start)),
-                               tuple(tuple(labels[i] for i in groups[g]) for g in path.steps), path.counts, path.rmse)
-                   for name, path in choice.paths.items())
+    curves = tuple(DesignCurve(name, tuple(tuple(labels[i] for i in groups[g]) for g in path.steps), path.counts,
+                               path.rmse) for name, path in choice.paths.items())
     return MarkerDesign(candidates.without([label for i, label in enumerate(labels) if i not in chosen]), choice.rmse,
                         full, float(np.sqrt(fits.linear.rest.mean())),
                         float(np.sqrt(np.concatenate(other).mean())) if other else float("nan"), curves)
@@ -181,10 +165,10 @@ def choose(linear: LinearBodies, groups: Groups, kept: np.ndarray, config: Desig
              "added": improve_set(MarkerSets(linear, groups, np.flatnonzero(kept)), ADD, free, sum(map(len, groups)),
                                   stops,
                                   told)}
-    # the better curve, improved by exchanges
+    # the better curve, and one round in which each marker of the set is compared with those left out
     best = best_path(paths, config.count)
     sets = MarkerSets(linear, groups, best.set(best.at(config.count)))
-    exchange(sets, free, EXCHANGES)
+    exchange(sets, free)
     alone = MarkerSets(linear, groups, np.flatnonzero(kept))
     if alone.count > FEWEST:
         paths["kept, removed"] = improve_set(alone, REMOVE, kept, FEWEST, stops, told)

@@ -10,19 +10,10 @@ from ..marker_sets.symmetry import label_pairs
 from .linear import LinearBodies
 
 
-def symmetric_groups(labels: Sequence[str], partners: np.ndarray | None = None) -> tuple[tuple[int, ...], ...]:
-    """Return the numbers of the markers of each pair, and of each single marker; `partners` (L,), else by label."""
-    partners = label_pairs(labels) if partners is None else np.asarray(partners, dtype=np.int64)
-    each = np.arange(len(labels))
-    if partners.shape != each.shape or partners.max(initial=-1) >= len(each):
-        raise ValueError(f"partners: expected a marker, or -1, for each of {len(each)}, got shape {partners.shape} "
-                         f"up to {partners.max(initial=-1)}")
-    other = np.where(partners < 0, each, partners)
-    # partners have to be mutual
-    wrong = np.flatnonzero(other[other] != each)
-    if len(wrong):
-        raise ValueError(f"partners: expected that the partner of {labels[other[wrong[0]]]} is {labels[wrong[0]]}, got "
-                         f"{labels[other[other[wrong[0]]]]}")
+def symmetric_groups(labels: Sequence[str]) -> tuple[tuple[int, ...], ...]:
+    """Return the numbers of the markers of each pair of left and right, and of each single marker, by label."""
+    pairs = label_pairs(labels)
+    other = np.where(pairs < 0, np.arange(len(labels)), pairs)
     return tuple((int(i),) if i == j else (int(i), int(j)) for i, j in enumerate(other) if i <= j)
 
 
@@ -171,24 +162,22 @@ def improve_set(sets: MarkerSets, sign: int, movable: np.ndarray, until: int, th
             report_progress(sets.count)
 
 
-def exchange(sets: MarkerSets, movable: np.ndarray, rounds: int) -> None:
-    """Try to exchange every group of the set, and single ones two at a time, for better ones, in some rounds.
+def exchange(sets: MarkerSets, movable: np.ndarray) -> int:
+    """Try to exchange every group of the set, and single ones two at a time, for better ones; count the exchanges.
 
     A pair may be exchanged for two single markers and the other way round.
     """
-    for _ in range(rounds):
-        done = 0
-        for group in np.flatnonzero(movable & sets.inside):
-            if sets.inside[group]:
-                done += _exchange(sets, movable, [int(group)])
-        for group in np.flatnonzero(movable & sets.inside & (sets.sizes == 1)):
-            others = np.flatnonzero(movable & sets.inside & (sets.sizes == 1))
-            others = others[others != group]
-            if sets.inside[group] and len(others):
-                least = others[np.argmin(sets.score_groups(others, REMOVE))]
-                done += _exchange(sets, movable, [int(group), int(least)])
-        if not done:
-            break
+    done = 0
+    for group in np.flatnonzero(movable & sets.inside):
+        if sets.inside[group]:
+            done += _exchange(sets, movable, [int(group)])
+    for group in np.flatnonzero(movable & sets.inside & (sets.sizes == 1)):
+        others = np.flatnonzero(movable & sets.inside & (sets.sizes == 1))
+        others = others[others != group]
+        if sets.inside[group] and len(others):
+            least = others[np.argmin(sets.score_groups(others, REMOVE))]
+            done += _exchange(sets, movable, [int(group), int(least)])
+    return done
 
 
 def _exchange(sets: MarkerSets, movable: np.ndarray, out: list[int]) -> bool:

@@ -12,8 +12,6 @@ from scanprep.geometry.sides import other_side
 from scanprep.geometry.surface import Surface
 from scanprep.skeleton.symmetry import find_symmetry
 
-from .layout import MarkerLayout
-
 
 @dataclass(frozen=True, eq=False)
 class SkinMirror:
@@ -47,32 +45,6 @@ def label_pairs(labels: Sequence[str]) -> np.ndarray:
     rows = {label: i for i, label in enumerate(labels)}
     others = [other_side(label) for label in labels]
     return np.array([i if other is None else rows.get(other, -1) for i, other in enumerate(others)], dtype=np.int64)
-
-
-def marker_pairs(layout: MarkerLayout, template: Mesh, mirror: SkinMirror | None = None) -> np.ndarray:
-    """Return the marker (L,) on the other side of every marker, by label, or by place where labels have no side.
-
-    It is the marker itself in the middle, and -1 without a partner; the partner's partner is the marker.
-    """
-    pairs, untold = label_pairs(layout.labels), np.flatnonzero([other_side(label) is None for label in layout.labels])
-    pairs[untold] = -1
-    if len(untold) == 0:
-        return pairs
-    mirror = mirror or find_skin_mirror(template)
-    skin = layout.skin_points(template.vertices)[untold]
-    image = mirror_points(layout, template, mirror)[untold]
-    apart = np.linalg.norm(image[:, None] - skin[None], axis=-1)
-    apart = apart + apart.T                                                    # there and back
-    for i, row in enumerate(untold):
-        j = int(apart[i].argmin())
-        if int(apart[j].argmin()) == i and apart[i, j] < 0.12:         # metres, there and back
-            pairs[row] = untold[j]
-    return pairs
-
-
-def mirror_points(layout: MarkerLayout, mesh: Mesh, mirror: SkinMirror) -> np.ndarray:
-    """Compute the mirror images (L, 3), metres, of the markers on the skin."""
-    return layout.skin_points(mirror.image(mesh))
 
 
 def find_skin_mirror(template: Mesh) -> SkinMirror:
