@@ -37,8 +37,6 @@ SAID_BY = {
     "completion/partial/report.py completion_page": "complete",
     "completion/partial/work.py complete_files": "complete",
     "completion/partial/work.py read_masks": "complete",
-    "completion/tracking/folder.py _by_folder": "track",
-    "completion/tracking/folder.py _by_pattern": "track",
     "completion/tracking/sequence.py tracking_problem": "track",
     "model/learning/scape.py judge_model": "learn",
     "model/coregistration/lead.py model_lead": "prep register, prep run",
