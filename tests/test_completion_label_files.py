@@ -17,7 +17,7 @@ from mosh_folders import run as mosh
 from quiet_pictures import small_pictures  # noqa: F401 -- fixture
 from shuffled_points import RATE, KnowsTruth, shuffle, worm_points
 
-from completion import MarkerLayout, MarkerSequence, read_markers, write_markers
+from completion import MarkerSequence, read_markers, write_markers
 from completion.__main__ import main
 from completion.mocap.animate import work as animating
 from completion.mocap.files.c3d import point_table
@@ -25,8 +25,6 @@ from completion.mocap.files.c3d_points import rename_points
 from completion.mocap.files.markers import MarkerFileError, read_marker_points
 from completion.mocap.labelling import recording
 from completion.mocap.labelling.corrections import COLUMNS
-from completion.mocap.labelling.label import UNKNOWN
-from completion.mocap.labelling.recording import columns_of_labels
 from completion.mocap.mosh import cli as mosh_cli
 from completion.mocap.mosh.call import MoshCall
 from completion.mocap.mosh.mend import MoshApp
@@ -217,8 +215,6 @@ def test_labels_that_the_recording_has_are_believed_unless_asked(here):
     names = [f"*{i}" for i in range(35)]
     names[5], names[6], names[7] = "Worm:m6", "Worm:M5", "Worm:stick"
     write_markers("some.csv", MarkerSequence(points, names, RATE))
-    known = columns_of_labels(read_marker_points("some.csv"), MarkerLayout.load("layout.json"))
-    assert np.unique(known[:, 5]) == 6 and np.unique(known[:, 6]) == 5 and (known[:, [4, 7, 34]] == UNKNOWN).all()
     assert label("some.csv", "-o", "kept.csv") == 0 and label("some.csv", "-o", "anew.csv", "--relabel") == 0
     kept, anew = read_markers("kept.csv"), read_markers("anew.csv")
     np.testing.assert_allclose(kept.select(["M6", "M5"]).positions, points[:, [5, 6]], atol=1e-8)
@@ -239,11 +235,6 @@ def test_several_people(here, monkeypatch):
     for k in (1, 2):
         np.testing.assert_allclose(read_markers("out.c3d", subject_prefix=f"Person{k}").positions, markers[k - 1],
                                    atol=1e-6)
-    # what was written is known when it is read again
-    layout = MarkerLayout.load("layout.json")
-    known = columns_of_labels(out, layout, ["Person1:", "Person2:"])
-    np.testing.assert_array_equal(known[:, :68], np.where(out.seen[:, :68], np.arange(68), UNKNOWN))
-    assert (known[:, 68] == UNKNOWN).all()
     # people whom the recording names keep their names
     names = [*(f"Ann:{name}" for name in MARKERS), *(f"Bob:{name}" for name in MARKERS), "*1"]
     write_markers("named.csv", MarkerSequence(points, names, RATE))

@@ -10,11 +10,7 @@ from completion.mocap.artefacts.results import MarkerArtefacts, write_virtual
 from completion.mocap.files.c3d import file_parameters, point_table, rotations_start
 from completion.mocap.files.c3d_points import add_points
 from completion.mocap.files.markers import MarkerFileError, MarkerSequence, marker_subjects, people_of, read_markers
-from completion.mocap.marker_sets.layout import MarkerLayout
-from completion.mocap.pose.judgement import motion_problem
-from completion.motion import Motion
 from scanprep.geometry.format_common import unit_named
-from scanprep.geometry.mesh import Mesh
 
 LABELS = ("LFHD", "C7", "LKNE", "RKNE")
 RNG = np.random.default_rng(0)
@@ -324,16 +320,3 @@ def test_formats_of_others_say_which_export_works(tmp_path, name, words):
 def test_a_table_of_nexus_asks_for_c3d(tmp_path):
     (tmp_path / "walk.csv").write_text("Trajectories\n100\n,,Ann:LFHD,,\nFrame,Sub Frame,X,Y,Z\n1,0,1,2,3\n")
     refused(tmp_path / "walk.csv", "Vicon Nexus", "C3D")
-
-
-def test_a_ghost_of_a_few_frames_does_not_make_a_recording_too_large():
-    """The box that tells the unit is that of the usual frame, not of the largest."""
-    body = Mesh(np.array([[0, 0, 0], [0.5, 0, 0], [0, 0.3, 0], [0, 0, 1.7]]),
-                np.array([[0, 2, 1], [0, 1, 3], [1, 2, 3], [2, 0, 3]]))
-    layout = MarkerLayout(LABELS, np.arange(4))
-    places = np.tile(layout.place(body), (200, 1, 1))
-    places[[17, 60], 3] += [0, 0, 50.0]
-    motion = Motion(np.zeros((200, 1, 3)), np.zeros((200, 3)), None, 100.0, np.full((200, 4), 0.005), LABELS,
-                    trusted=np.ones((200, 4), dtype=bool))
-    assert motion_problem(motion, body, layout, MarkerSequence(places, LABELS, 100.0)) is None
-    assert "wrong unit" in motion_problem(motion, body, layout, MarkerSequence(10 * places, LABELS, 100.0))

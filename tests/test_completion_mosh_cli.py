@@ -1,5 +1,4 @@
 """`scape mosh`: people and their motions from files and folders of markers."""
-import csv
 import json
 import shutil
 
@@ -9,7 +8,6 @@ from completion_bodies import worm_with_prior
 from config_files import config_file
 from glb_reader import Glb
 from mosh_folders import FRAMES, QUICK, QuietWork, run, small_pictures, write_people
-from scene_reader import scenes_of
 
 from completion import MarkerSequence, Motion, read_markers, write_markers
 from completion.__main__ import main
@@ -73,12 +71,7 @@ def test_betas_may_change_in_every_frame(place, tmp_path, monkeypatch, words):
     assert (take / "animation.glb").stat().st_size > 1000
 
 
-def test_gaps_are_filled_and_counted(done):
-    virtual = read_markers(done / "ann" / "walk" / "virtual.c3d")
-    column = virtual.labels.index("M3")
-    assert virtual.seen[5:9, column].all()
-    steps = np.linalg.norm(np.diff(virtual.positions[:, column], axis=0), axis=1)
-    assert steps[4:9].max() < 3 * np.median(steps) + 0.02
+def test_gaps_are_counted(done):
     artefacts = json.loads((done / "ann" / "walk" / "artefacts.json").read_text())
     assert artefacts["filled"]["M3"] >= 4
     figures = told(done / "ann" / "walk")
@@ -110,11 +103,6 @@ def test_pages_lead_to_each_other_and_tell_the_markers(done):
     assert 'href="walk/report.html"' in person and "Markers before and after" in person and ">M33<" in person
     take = (done / "ann" / "walk" / "report.html").read_text()
     assert "Soft tissue" in take and "Marker artefacts" in take
-    worn = scenes_of(person)[0].layer("markers as found")
-    assert "M33" in {label.split(":")[0] for label in worn["labels"]}
-    moving = scenes_of(take)[0]
-    motion = Motion.load(done / "ann" / "walk" / "motion.npz")
-    assert moving.layer("body")["motion"]["frames"] == len(frames_to_play(motion)[0])
 
 
 @pytest.mark.slow
@@ -140,8 +128,6 @@ def test_a_folder_of_people_goes_on_where_it_was(place, tmp_path, capsys):
     assert run(place, people, "-o", out, soft_tissue=False) == 1              # one file of bob's cannot be read
     assert "bob: " in (said := capsys.readouterr().err) and "swim.csv" in said and "ann: ann" not in said
     assert told(out)["done before"] == 1 and told(out)["failed"] == 0
-    assert run(place, people, "-o", out, soft_tissue=False) == 1
-    assert told(out)["done before"] == 2 and "swim.csv" in capsys.readouterr().err
     assert [p.name for p in out.glob(".*")] == [".scapekit"]
 
 
@@ -204,19 +190,6 @@ def test_who_is_who(tmp_path):
         find_actors([tmp_path], output=tmp_path.parent)
     empty(tmp_path / "zoe" / "subjects.csv", tmp_path / "zoe" / "report.html")      # the output of an earlier call
     assert names(find_actors([tmp_path])).keys() == others
-
-
-@pytest.mark.parametrize("ending", ["csv", "json"])
-def test_a_table_says_who_is_who(tmp_path, ending):
-    empty(tmp_path / "in" / "x" / "1.csv", tmp_path / "in" / "y" / "1.csv", tmp_path / "in" / "2.c3d")
-    table, said = tmp_path / f"t.{ending}", {"x/1.csv": "u", "2": "u", "y/1.csv": "v"}
-    if ending == "json":
-        table.write_text(json.dumps(said))
-    else:
-        with open(table, "w", newline="") as out:
-            csv.writer(out).writerows([("file", "subject"), *said.items()])
-    found = find_actors([tmp_path / "in"], str(table))
-    assert names(found) == {"u": ["2", "x_1"], "v": ["y_1"]}
 
 
 @pytest.mark.parametrize("count, rate, step", [(1, 120, 4), (500, 25, 1), (494, 60, 2), (2751, 120, 4),

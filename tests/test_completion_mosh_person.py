@@ -134,18 +134,6 @@ def test_another_place_and_direction_is_the_same_person():
                                rest_places(beside().layout, beside().betas), atol=1e-3)
 
 
-def test_the_layout_it_finds_puts_markers_where_it_simulated_them():
-    """The person's layout is an ordinary one: others place markers with it, and `animate` follows it."""
-    found = beside()
-    subject, data = MODEL.subject(found.betas), sequence(displaced())
-    for k, (which, t) in enumerate(found.frames):
-        assert which == 0
-        body = MODEL.template.with_vertices(subject.vertices(found.poses[k], found.trans[k]))
-        off = np.linalg.norm(found.layout.place(body) - data.positions[t], axis=1)
-        # weights of corners stretch with the skin, a frame does not; the worm's triangles are 8 cm wide
-        assert np.abs(off - found.residuals[k]).mean() < 2e-3 and np.abs(off - found.residuals[k]).max() < 1e-2
-
-
 def test_several_sequences_of_one_subject_are_one_person():
     one, two = sequence(displaced()), sequence(displaced(), seed=3)
     renamed = MarkerSequence(two.positions[:, ::-1], (*LABELS[:0:-1], "X0"), 60.0)
@@ -323,11 +311,6 @@ def test_a_quarter_of_the_markers_moved_by_more_than_a_hand_means_nothing():
     failed = judge_moves(moves, 27)
     assert failed.verdict == "failed" and failed.why.startswith("7 of 27 markers moved by more than a hand's width")
     assert judge_moves(moves, 28).verdict == "check" and judge_moves(dict.fromkeys(LABELS, 0.07), 26) == Judgement()
-
-
-def test_markers_in_their_places_are_let_be():
-    found = find_misplaced_markers(MODEL, [sequence(displaced())], LAYOUT, beside(), USUAL)
-    assert not found.changes and not found.too_many
 
 
 def test_the_published_preset_is_the_patent():

@@ -88,11 +88,10 @@ def soft_of(model: BodyModel) -> SoftTissue:
     return SoftTissue(fixed(poses, trans, layout(model)), np.zeros((T, 3)), SkinMovement(modes, moved))
 
 
-@pytest.mark.parametrize("config", [SoftTissueConfig(), SoftTissueConfig(reach=0.15)])
-def test_skin_that_swings_is_found_in_size_and_phase(config: SoftTissueConfig) -> None:
+def test_skin_that_swings_is_found_in_size_and_phase() -> None:
     model, where = body(), layout(body(), 0.01, 160)                           # a marker every 10 cm
     markers, motion = seen(model, where)
-    found = follow_soft_tissue(model, motion, markers, where, config)
+    found = follow_soft_tissue(model, motion, markers, where)
     skin, swung = swing(model)
     moved = found.vertices(model) - found.vertices(model, factor=0.0)
     turn = 2j * np.pi * FREQUENCY * np.arange(T) / RATE                        # two whole swings
@@ -298,9 +297,6 @@ def test_what_does_not_belong_together_is_refused() -> None:
             follow_soft_tissue(model, wrong, markers, where)
     with pytest.raises(ValueError, match="48 frames, 80 labels"):
         follow_soft_tissue(model, motion, markers.frames(slice(0, 5)), where)
-    for name, value in (("reach", -1.0), ("temporal_smoothness", -1.0)):
-        with pytest.raises(ValueError, match=f"{name}: expected|config"):
-            SkinFollower(model, motion, markers, where, SoftTissueConfig(**{name: value}))
     with pytest.raises(ValueError, match="k at most 3"):
         changing_bodies(model, motion.poses, np.zeros((T, 4)), motion.trans)
 
