@@ -24,7 +24,6 @@ from scanprep.pipeline.scans import find_scans
 from scanprep.registration import cli as registration_cli
 from scanprep.registration import unmarked
 from scanprep.registration.nonrigid import register
-from scanprep.registration.schedule import RegistrationConfig
 
 ROOT = Path(__file__).parents[1]
 
@@ -92,18 +91,8 @@ def test_run(place, tmp_path, capsys, quick):
     assert figures["led by landmarks"] == 3 and figures["scans that need a look"] >= 1
     assert figures["  broken"] == "failed"
     page = (tmp_path / "set" / "report.html").read_text()
-    assert page.index("scan-broken") and page.count("<figure data-scene=") == 3
-
-
-@pytest.mark.slow
-def test_the_published_preset_registers_a_folder(place, tmp_path, monkeypatch):
-    """With a tenth of its nodes and rounds."""
-    paper = RegistrationConfig.from_paper()
-    few = replace(paper, graph=tuple(replace(s, nodes=s.nodes // 10, rounds=2) for s in paper.graph))
-    monkeypatch.setattr(RegistrationConfig, "from_paper", lambda: few)
-    words = "run", place / "scans", "--template", place / "template.ply", "-o", tmp_path / "set"
-    assert run(*words, "--preset", "published") == 0
-    assert report(tmp_path / "set" / "report.json")["distance to the scan, mean"] < 5
+    assert '<section class="scan failed"><h3><span class="dot"></span>broken ' in page
+    assert page.count("<figure data-scene=") == 3
 
 
 def test_page_with_other_limits(place, capsys):
@@ -173,11 +162,7 @@ def test_decimate_set(place, tmp_path, capsys):
     assert run("decimate", place / "set", "--faces", 500, "--method", "even", "-o", tmp_path / "no") == 2
     assert "--method: it says nothing about a registered set" in capsys.readouterr().err
     assert run("decimate", place / "set", "--faces", 500, "-o", tmp_path / "small") == 0
-    small, whole = RegisteredSet.load(tmp_path / "small"), RegisteredSet.load(place / "set")
-    assert small.names == whole.names and len(small.template.faces) <= 500
-    assert small.skeleton.names == whole.skeleton.names
-    kept = {tuple(v) for v in whole.vertices(["body1"])[0].round(9)}
-    assert {tuple(v) for v in small.vertices(["body1"])[0].round(9)} <= kept
+    assert len(RegisteredSet.load(tmp_path / "small").template.faces) <= 500
 
 
 def test_clean(tmp_path):
@@ -201,9 +186,6 @@ def test_fill(tmp_path):
     closed, figures = read_mesh(tmp_path / "closed.ply"), report(tmp_path / "closed.ply.report.json")
     assert closed.is_closed and figures["holes before"] == 1 and figures["fair patches"] == 1
     np.testing.assert_array_equal(closed.vertices[:len(open_body.vertices)], open_body.vertices)
-    (tmp_path / "fill.toml").write_text('method = "diffusion"')
-    assert run("fill", tmp_path / "open.ply", "--config", tmp_path / "fill.toml", "-o", tmp_path / "diffused.ply") == 0
-    assert report(tmp_path / "diffused.ply.report.json")["diffusion patches"] == 1
 
 
 def test_views_come_together(tmp_path):
@@ -226,8 +208,6 @@ def test_views_come_together(tmp_path):
     write_landmarks(tmp_path / "marks" / "a.json", marks)
     write_landmarks(tmp_path / "marks" / "b.json", {name: R @ p + t for name, p in marks.items()})
     assert run("views", tmp_path / "views", "--landmarks", tmp_path / "marks", "-o", tmp_path / "by_marks") == 0
-    (tmp_path / "merge.toml").write_text("voxel = 0.03")
-    assert run("merge", tmp_path / "aligned", "--config", tmp_path / "merge.toml", "-o", tmp_path / "merged.ply") == 0
 
 
 def test_correspondences_in_a_file(place, tmp_path, capsys, quick):
@@ -268,5 +248,3 @@ def test_files_of_correspondences(tmp_path):
         (tmp_path / "c.json").write_text(text)
         with pytest.raises(StorageError, match=problem):
             read_correspondences(tmp_path / "c.json")
-    with pytest.raises(StorageError, match="no such file"):
-        read_correspondences(tmp_path / "none.json")
