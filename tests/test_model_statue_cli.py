@@ -121,7 +121,7 @@ def test_every_figure_that_calls_a_statue_wrong_is_in_its_verdict(made, wrong, v
 
 
 @pytest.mark.slow
-def test_reconstruction_at_every_level_is_closed(made, tmp_path):
+def test_a_reconstruction_has_the_level_or_the_tolerance_asked_for(made, tmp_path):
     assert run("reconstruct", made / "statue", "-o", tmp_path / "even.ply", "--level", 2) == 0
     count = len(load_statue(made / "statue").control.mesh.vertices)
     assert len(read_mesh(tmp_path / "even.ply").vertices) == 4 * (4 * count - 6) - 6
