@@ -91,8 +91,6 @@ NOTHING = {
     "a ball to align": ("prep align ball_mesh.ply good.ply -o out.ply", ["a start far from the target"]),
     "another unit to align": ("prep align large.ply good.ply -o out.ply --unit m", ["--unit", "times as large"]),
 }
-GOOD = {"a scan": REGISTER.format("good"), "with landmarks": REGISTER.format("good") + " --landmarks good.json",
-        "to align": "prep align good.ply template.ply -o out.ply"}
 
 
 @pytest.mark.slow
@@ -118,13 +116,6 @@ def test_another_unit_is_refused_before_the_search(place, tmp_path, capsys):
     work = CompletionTask(worm_with_prior().subject(None), "model.npz", MARKS, QUICK, "in")
     with pytest.raises(WrongScaleError, match=r"the scan is .* times as large as the body: the wrong unit"):
         complete_files(work, CompletionInputs((Path("half.ply"),)), TaskContext(tmp_path / "out"))
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("case", GOOD)
-def test_good_results_stay_good(place, capsys, case):
-    assert main(GOOD[case].split()) == 0
-    assert "MEANS NOTHING" not in capsys.readouterr().err
 
 
 @pytest.mark.slow
@@ -172,13 +163,13 @@ def walk(layout, scale=1.0):
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("case", "words"), [
-    ("good", None), ("inch", ["--unit"]), ("tenth", ["--unit", "0.1"]), ("shuffled", ["another layout"]),
+    ("good", None), ("tenth", ["--unit", "0.1"]), ("shuffled", ["another layout"]),
     ("mirrored", ["left and right"])])
 def test_motions(tmp_path, case, words):
     model = worm_with_prior()
     layout = MarkerLayout(LABELS, ROWS, 0.012)
     layout.save(tmp_path / "layout.json")
-    markers = walk(layout, {"inch": 39.4, "tenth": 0.1}.get(case, 1.0))
+    markers = walk(layout, 0.1 if case == "tenth" else 1.0)
     if case == "shuffled":
         markers = dataclasses.replace(markers, labels=tuple(np.random.default_rng(1).permutation(LABELS).tolist()))
     if case == "mirrored":                                          # head and tail exchanged
@@ -361,6 +352,7 @@ COMMANDS = ("prep clean good.ply -o clean.ply", "prep fill good.ply -o filled.pl
             "prep decimate good.ply --faces 300 -o fewer.ply", "prep template good.ply --faces 500 -o mine.ply",
             "prep repair good.ply -o repaired.ply", "prep correspond good.ply --template template.ply -o pairs.json",
             "prep register good.ply --template template.ply --config quick.toml -o out.ply",
+            "prep register good.ply --template template.ply --config quick.toml --landmarks good.json -o out.ply",
             "prep align good.ply template.ply -o aligned.ply",
             "model info model.npz", "model mesh model.npz -o mesh.ply", "model sample model.npz -n 2 -o sampled",
             "model export model.npz -o body.bvh", "model export model.npz -o body.ply",
@@ -372,7 +364,8 @@ def test_the_first_row_of_every_command_is_a_verdict(place, monkeypatch, command
     shown = []
     monkeypatch.setattr(command_line, "show", shown.extend)
     worm_with_prior().save("model.npz")
-    code = main(command.split())                         # a worm has no limbs by which correspondences would be sure
+    code = main(command.split())
+    assert code == ("correspond" in command)             # a worm has no limbs by which they would be sure
     assert shown[0].name == "judgement" and shown[0].value == ("failed" if code else "good")
     if "-o" in command:
         output = Path(command.split()[-1])
@@ -481,19 +474,6 @@ def test_a_motion_that_did_not_settle_or_lost_the_body_needs_a_look(scale):
     far[2, ::2], far[2, 1] = 0.2 * size(body), 0.2 * size(body)
     (doubt,) = motion_doubts([motion], [slow], body)
     assert doubt.startswith(f"in 1 of {len(far)} frames half of the markers are far")
-
-
-def test_a_ghost_of_one_frame_says_nothing_of_the_unit():
-    layout = MarkerLayout(LABELS, ROWS, 0.012)
-    markers = walk(layout)
-    positions = np.array(markers.positions)
-    positions[3, 5] += [0.0, 0.0, 50.0]
-    motion = Motion(np.zeros((len(positions), 4, 3)), np.zeros((len(positions), 3)), None, 30.0,
-                    np.full(positions.shape[:2], 0.004), LABELS)
-    body = worm_with_prior().template
-    assert motion_problem(motion, body, layout, dataclasses.replace(markers, positions=positions)) is None
-    big = dataclasses.replace(markers, positions=10 * markers.positions)
-    assert "the wrong unit?" in motion_problem(motion, body, layout, big)
 
 
 def test_the_size_of_a_body_far_from_its_markers_is_told_last():

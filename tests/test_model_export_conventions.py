@@ -175,15 +175,6 @@ def test_the_command_has_root_names_ground_and_front(files, model, rig, motion):
             assert np.abs(world[j][:3, 3] - 0.01 * places[node["name"]]).max() < 1e-5
 
 
-@pytest.mark.parametrize(("arguments", "words"), [
-    (["--root", "nose"], "root: expected a part of the body (part0, part1, part2, part3), got 'nose'"),
-    (["--names", "vrm"], "names: expected a person's parts (pelvis, thigh_left, ...)")])
-def test_the_command_refuses_in_one_line(files, arguments, words, capsys):
-    assert run(export, "scape model export", [str(files / "model.npz"), "-o", str(files / "c.glb"), *arguments]) == 1
-    error = capsys.readouterr().err
-    assert words in error and not (files / "c.glb").exists()
-
-
 @pytest.mark.parametrize("name", ["d.ply", "d.glb"])
 def test_a_mesh_stands_on_the_ground_and_looks_at_the_viewer(files, model, name):
     arguments = [str(files / "model.npz"), "-o", str(files / name), "--own-body"]

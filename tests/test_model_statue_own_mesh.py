@@ -1,5 +1,4 @@
 """The file's own mesh on the skeleton of its statue: its places, materials and weights, read by a reader of its own."""
-import json
 from dataclasses import replace
 
 import numpy as np
@@ -9,6 +8,7 @@ from glb_reader import Glb
 from PIL import Image
 from quiet_pictures import small_pictures  # noqa: F401 -- fixture
 from scipy.spatial import cKDTree
+from test_model_statue_control import changed
 from trimesh.visual import TextureVisuals
 from trimesh.visual.material import PBRMaterial
 
@@ -169,18 +169,13 @@ def test_other_files_become_glb_in_metres_with_y_up(statue, tmp_path, ending):
 
 def test_a_skin_of_the_file_is_replaced_and_morph_targets_stay(file, written, statue, tmp_path):
     """The written file as input: it is skinned already, by bones of other names."""
-    data = written[0].read_bytes()
-    size = int.from_bytes(data[12:16], "little")
-    tree = json.loads(data[20:20 + size])
-    primitive = tree["meshes"][0]["primitives"][0]
-    primitive["targets"] = [{"POSITION": primitive["attributes"]["NORMAL"]}]
-    tree["meshes"][0]["extras"] = {"targetNames": ["smile"]}
-    tree["asset"].pop("generator")
-    text = json.dumps(tree).encode()
-    text += b" " * (-len(text) % 4)
-    again = tmp_path / "skinned.glb"
-    again.write_bytes(data[:8] + (20 + len(text) + len(data) - 20 - size).to_bytes(4, "little")
-                      + len(text).to_bytes(4, "little") + b"JSON" + text + data[20 + size:])
+    def smiling(tree, rest):
+        primitive = tree["meshes"][0]["primitives"][0]
+        primitive["targets"] = [{"POSITION": primitive["attributes"]["NORMAL"]}]
+        tree["meshes"][0]["extras"] = {"targetNames": ["smile"]}
+        tree["asset"].pop("generator")
+
+    again = changed(written[0], smiling)
     rows = {row.name: row.value for row in write_own_mesh(tmp_path / "own.glb", again, 2.0, replace(
         in_file_axes(statue), control=in_file_axes(statue).control.refit(
             2 * HUMAN.mesh.vertices @ turn_up(2).T, 2 * HUMAN.skeleton.joints @ turn_up(2).T)))}
