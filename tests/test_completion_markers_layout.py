@@ -101,11 +101,6 @@ def test_bad_layouts_say_what_is_wrong(tmp_path, content, words):
     assert str(path) in message and "\n" not in message and all(word in message for word in words), message
 
 
-def test_a_missing_layout(tmp_path):
-    with pytest.raises(MarkerFileError, match=r"none\.json: no such file"):
-        MarkerLayout.load(tmp_path / "none.json")
-
-
 def test_a_layout_of_another_body_is_refused_when_placing():
     with pytest.raises(ValueError, match=r"marker 'B' sits on vertex 7, the body has 0..3"):
         MarkerLayout(("A", "B"), np.array([0, 7])).place(MESH)

@@ -4,8 +4,6 @@ import pytest
 from model.fitting.limbs import runs_without_branch
 from model.priors import FLOOR, gaussian_prior, typical_poses
 
-EXAMPLES = np.random.default_rng(7).normal(0, 0.4, (12, 4, 3)) * (np.arange(4) > 0)[:, None]
-
 
 def moments(J=4, seed=0):
     rng = np.random.default_rng(seed)

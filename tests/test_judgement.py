@@ -476,6 +476,19 @@ def test_a_motion_that_did_not_settle_or_lost_the_body_needs_a_look(scale):
     assert doubt.startswith(f"in 1 of {len(far)} frames half of the markers are far")
 
 
+def test_a_ghost_of_one_frame_says_nothing_of_the_unit():
+    layout = MarkerLayout(LABELS, ROWS, 0.012)
+    markers = walk(layout)
+    positions = np.array(markers.positions)
+    positions[3, 5] += [0.0, 0.0, 50.0]
+    motion = Motion(np.zeros((len(positions), 4, 3)), np.zeros((len(positions), 3)), None, 30.0,
+                    np.full(positions.shape[:2], 0.004), LABELS)
+    body = worm_with_prior().template
+    assert motion_problem(motion, body, layout, dataclasses.replace(markers, positions=positions)) is None
+    big = dataclasses.replace(markers, positions=10 * markers.positions)
+    assert "the wrong unit?" in motion_problem(motion, body, layout, big)
+
+
 def test_the_size_of_a_body_far_from_its_markers_is_told_last():
     person, own = Judgement.of("the person is 3.08 m tall"), Judgement.of("the markers are 421 mm off")
     body = worm_with_prior().template

@@ -141,11 +141,6 @@ def test_settings_that_left_are_told_in_one_sentence_each(tmp_path, capsys):
         "page\n")
 
 
-def test_a_file_that_is_not_there(tmp_path, capsys):
-    config, code, said = run(["--config", tmp_path / "none.toml"], capsys)
-    assert config is None and code == 2 and "none.toml" in said.err
-
-
 def test_the_written_file_says_what_everything_means(capsys):
     config, code, said = run(["--write-config", "--preset", "published"], capsys)
     assert config is None and code == 0

@@ -148,10 +148,7 @@ def test_views_become_a_template():
 
 
 def test_meshlab_as_a_method():
-    try:
-        __import__("pymeshlab")
-    except (ImportError, OSError) as error:
-        pytest.skip(f"pymeshlab cannot be imported: {error}")
+    pytest.importorskip("pymeshlab", exc_type=ImportError)
     mesh = bumpy(5)
     small = decimate(mesh, 3000, DecimateConfig("pymeshlab"))
     assert small.is_closed and len(small.faces) == pytest.approx(3000, abs=4)

@@ -1,7 +1,12 @@
 """Surface distances whose true value is known."""
+import sys
+from pathlib import Path
+
 import numpy as np
 import pytest
 import trimesh
+
+sys.path.insert(0, str(Path(__file__).with_name("benchmarks")))
 from surface_distances import surface_distance
 
 from scanprep.geometry.mesh import Mesh

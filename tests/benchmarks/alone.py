@@ -78,7 +78,7 @@ def main() -> None:
             value = call(*args)
         except Exception as error:               # one tool that fails must not end the run
             kind = type(error).__name__          # by its name: this file is another module here
-            why = {"missing": str(error)} if kind == "Missing" else {"failed": f"{kind}: {error}"}
+            why = {"missing": str(error)} if kind == "MissingError" else {"failed": f"{kind}: {error}"}
         pickle.dump((value, time.perf_counter() - wall, processor_seconds() - cpu, why), out)
 
 

@@ -44,7 +44,7 @@ class Stage:
 
     def bodies(self, person: SyntheticPerson, count: int, rng: np.random.Generator, spread: float = 1.0) -> np.ndarray:
         """One person in random poses (count, N, 3)."""
-        return np.stack([person.in_pose(random_pose(rng, spread))[self.kept] for _ in range(count)])
+        return np.stack([person.in_pose(spread * random_pose(rng))[self.kept] for _ in range(count)])
 
     def people(self, count: int, each: int, rng: np.random.Generator, spread: float = 1.0) -> np.ndarray:
         """New people in poses of their own (count * each, N, 3)."""

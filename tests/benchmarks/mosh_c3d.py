@@ -34,9 +34,9 @@ from protocols import machine, write_report
 from completion.mocap.files.markers import MarkerSequence, read_markers
 from completion.mocap.marker_sets.layout import MarkerLayout
 from completion.mocap.marker_sets.named import load_layout
-from completion.mocap.mosh import takes
 from completion.mocap.mosh.mosh import MoshConfig
 from completion.mocap.pose.follow import animate
+from completion.mocap.pose.marked_body import supports
 from completion.mocap.soft_tissue.follow import follow_soft_tissue
 from completion.mocap.soft_tissue.soft_tissue import SoftTissue
 from completion.mocap.subject.attachment import LatentMarkers, latent_markers
@@ -44,6 +44,7 @@ from completion.mocap.subject.person import PersonFit, find_person, spread_frame
 from completion.motion import Motion
 from model.body import BodyModel
 from model.files import load_model
+from model.fitting.energy import rise_above_skin
 from model.fitting.vertices import fit_pose
 from model.measurement.find import find_tapes
 from model.measurement.measure import measure
@@ -55,10 +56,18 @@ MEASURES = ("stature", "chest_girth", "waist_girth", "hip_girth")
 def held_out(model: BodyModel, motion: Motion, soft: SoftTissue | None, markers: MarkerSequence, layout: MarkerLayout
              ) -> dict[str, object]:
     """How far the body is from the markers that were in no stage, millimetres: plain, and calibrated."""
-    plain = takes.measure_held_out(model, layout, HELD_OUT, markers, motion, soft)
-    assert plain is not None and motion.betas is not None, "markers were held out of a person"
-    seen, subject = markers.select(plain.labels).positions, model.subject(motion.betas)
-    known = [label for label in markers.labels if label not in plain.labels]
+    assert motion.betas is not None, "markers were held out of a person"
+    wanted = {layout.aliases.get(label, label) for label in HELD_OUT}
+    labels = tuple(label for label in layout.match_labels(markers.labels, 0)
+                   if layout.aliases.get(label, label) in wanted)
+    seen, subject = markers.select(labels).positions, model.subject(motion.betas)
+    known = [label for label in markers.labels if label not in labels]
+    # simulated markers of the layout's places on the fixed shape
+    places = layout.select(labels)
+    ids, weights = supports(model.template, places)
+    lift = np.asarray(places.distances)
+    points = model.points(ids, weights, len(motion.betas)).operator(motion.betas)
+    plain = np.linalg.norm(rise_above_skin(points.evaluate(motion.poses, motion.trans), lift) - seen, axis=2)
     frames = spread_frames(markers.select(known).positions, CALIBRATED)
 
     def fixed(ids: np.ndarray) -> np.ndarray:
@@ -66,15 +75,17 @@ def held_out(model: BodyModel, motion: Motion, soft: SoftTissue | None, markers:
 
     near = calibrated(model, fixed, motion.vertices(subject, frames), seen, frames)
     row: dict[str, object] = {
-        "held_out_mm": mean_mm(plain.fixed), "calibrated_mm": mean_mm(near),
-        "each_mm": dict(zip(plain.labels, (1e3 * np.nanmean(plain.fixed, axis=0)).round(1).tolist(), strict=True)),
-        "each_calibrated_mm": dict(zip(plain.labels, (1e3 * np.nanmean(near, axis=0)).round(1).tolist(), strict=True))}
-    if soft is None or plain.soft is None:
+        "held_out_mm": mean_mm(plain), "calibrated_mm": mean_mm(near),
+        "each_mm": dict(zip(labels, (1e3 * np.nanmean(plain, axis=0)).round(1).tolist(), strict=True)),
+        "each_calibrated_mm": dict(zip(labels, (1e3 * np.nanmean(near, axis=0)).round(1).tolist(), strict=True))}
+    if soft is None:
         return row
+    soft_points = soft.points(model, ids, weights)
+    soft_plain = np.linalg.norm(rise_above_skin(soft_points, lift) - seen, axis=2)
     near = calibrated(model, lambda ids: soft.points(model, ids[:, None], np.ones((len(ids), 1))),
                       soft.vertices(model, frames), seen, frames)
-    return row | {"soft_held_out_mm": mean_mm(plain.soft), "soft_calibrated_mm": mean_mm(near),
-                  "soft_each_calibrated_mm": dict(zip(plain.labels, (1e3 * np.nanmean(near, axis=0)).round(1).tolist(),
+    return row | {"soft_held_out_mm": mean_mm(soft_plain), "soft_calibrated_mm": mean_mm(near),
+                  "soft_each_calibrated_mm": dict(zip(labels, (1e3 * np.nanmean(near, axis=0)).round(1).tolist(),
                                                       strict=True))}
 
 

@@ -103,7 +103,8 @@ def measure(model: BodyModel, found: Character, soft: SoftTissue, factor: float,
     smooth = creases.smooth(changed, poses)
     row["smoothing_ms"] = MM * (time.process_time() - start) / len(frames)
     row["smoothing_moved_mm"] = MM * float(np.linalg.norm(smooth - changed, axis=2).max())
-    theirs = Creases(at_rest(model, soft.motion.betas), model.skeleton).find_inverted(person, poses)
+    shaped = model.template.with_vertices(model.vertices(np.zeros_like(poses[0]), soft.motion.betas))
+    theirs = Creases(shaped, model.skeleton).find_inverted(person, poses)
     row["turned_on_person"] = int(theirs.sum())
     before, after = creases.find_inverted(changed, poses), creases.find_inverted(smooth, poses)
     row |= {"turned": int(before.sum()), "turned, smoothed": int(after.sum()),

@@ -63,7 +63,7 @@ def walking(person: SyntheticPerson, layout: MarkerLayout, rng: np.random.Genera
     beside -= (beside * normals).sum(axis=1, keepdims=True) * normals
     on = Surface(person.mesh).closest(person.mesh.vertices[layout.vertices] + beside)
     worn = MarkerLayout(layout.labels, person.mesh.faces[on.faces], layout.distances, on.bary)
-    poses, trans = synthesise_walk(frames, RATE, rng.uniform(0.8, 1.2))
+    poses, trans = synthesise_walk(frames, RATE / rng.uniform(0.8, 1.2))
     poses = poses + 0.04 * rng.normal(size=poses.shape[1:])
     bodies = [person.mesh.with_vertices(person.in_pose(p, t)) for p, t in zip(poses, trans, strict=True)]
     return MarkerSequence(np.stack([worn.place(body) for body in bodies]), layout.labels, RATE)

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from alone import Missing, processor_seconds
+from alone import MissingError, processor_seconds
 
 
 @dataclass(frozen=True)
@@ -75,7 +75,7 @@ def modules() -> tuple[Any, Any]:
         import pymomentum.geometry as geometry
         import pymomentum.marker_tracking as tracking
     except ImportError as error:
-        raise Missing("pymomentum-core") from error
+        raise MissingError("pymomentum-core") from error
     finally:
         del sys.modules["torch"]
     geometry.set_log_level(geometry.LogLevel.Error)

@@ -27,7 +27,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from alone import Missing, alone
+from alone import MissingError, alone
 from protocols import RealData, load_real, machine, write_report
 from scans import TestScan, errors, test_scan
 from scipy.spatial import cKDTree
@@ -37,7 +37,7 @@ from scanprep.alignment.icp import align_landmarks
 
 def need(package: str) -> None:
     if importlib.util.find_spec(package) is None:
-        raise Missing(package)
+        raise MissingError(package)
 
 
 def placed(data: RealData, item: TestScan) -> np.ndarray:
@@ -82,7 +82,7 @@ def nricp_sumner(data: RealData, item: TestScan, _: str) -> np.ndarray:
 def geodesic_drift(data: RealData, item: TestScan, bcpd: str) -> np.ndarray:
     """Bayesian coherent point drift with the geodesic kernel of the template's triangles, accelerated."""
     if not bcpd or not Path(bcpd).exists():
-        raise Missing("bcpd")
+        raise MissingError("bcpd")
     with tempfile.TemporaryDirectory() as folder:
         np.savetxt(Path(folder, "x.txt"), item.scan.vertices)
         np.savetxt(Path(folder, "y.txt"), placed(data, item))
