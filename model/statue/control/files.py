@@ -26,7 +26,7 @@ from .model import ControlModel, control_problem, surface_problem
 # share of the surface that the largest component must have: eyes, teeth and claws have a tenth, a second body a half
 LEAST = 0.7
 KIND, VERSION = "control model", 1
-STORED = Path(__file__).with_name("humanoid.npz")           # made by tests/humanoid_maker.py
+STORED = Path(__file__).with_name("humanoid.npz")           # our own mesh, once moved onto the built-in people
 
 
 def read_control(path: str | Path) -> ControlModel:
