@@ -46,7 +46,7 @@ def test_killed_in_the_middle_and_started_again(six, template, tmp_path, sign):
     done = finished(tmp_path / "set")
     assert 2 <= len(done) < 5, "killed too late to show anything"
     if sign == signal.SIGINT:
-        assert 'id="scan-' in (tmp_path / "set" / "report.html").read_text()
+        assert '<section class="scan ' in (tmp_path / "set" / "report.html").read_text()
     stamps = {name: (tmp_path / "set" / "meshes" / f"{name}.ply").stat().st_mtime_ns for name in done}
     again = prepare(find_scans(scans), template, MARKS, tmp_path / "set", QUICK)
     assert again.fresh == 5 - len(done)
